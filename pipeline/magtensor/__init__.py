@@ -1,0 +1,28 @@
+"""magtensor: calibration of magnetic gradient tensor systems, with the loop closed by measured data."""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+__version__ = "0.1.0"
+
+_LAZY = {
+    "stage": "magtensor.components",
+    "method": "magtensor.components",
+    "reader": "magtensor.components",
+    "metric": "magtensor.components",
+    "Method": "magtensor.components",
+    "DataError": "magtensor.errors",
+    "UsageError": "magtensor.errors",
+    "NotEnoughData": "magtensor.errors",
+}
+__all__ = ["DataError", "Method", "NotEnoughData", "UsageError", "__version__", "method", "metric", "reader", "stage"]
+
+if TYPE_CHECKING:
+    from magtensor.components import Method, method, metric, reader, stage
+    from magtensor.errors import DataError, NotEnoughData, UsageError
+
+
+def __getattr__(name: str) -> Any:
+    if name in _LAZY:
+        return getattr(import_module(_LAZY[name]), name)
+    raise AttributeError(f"module 'magtensor' has no attribute {name!r}")

@@ -1,0 +1,164 @@
+"""What a plugin is made of: functions marked as a stage, a method, a reader or a metric.
+
+The marked function stays an ordinary function. Its keyword-only parameters are its options: their types,
+defaults and descriptions become the recipe schema, `magtensor plugins` and the documentation.
+
+    @stage(needs=("b_raw",), gives=("b_smooth",))
+    def smooth(survey, *, window_s: Annotated[float, Field(gt=0, description="length of the window, s")] = 1.0):
+        \"\"\"Running mean of the raw output.\"\"\"
+        return {"b_smooth": ...}
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, TypeVar
+
+if TYPE_CHECKING:
+    from pydantic import BaseModel
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+MARK = "__magtensor__"
+KINDS = ("stage", "method", "reader", "metric")
+
+
+class Method:
+    """Marks the option of a stage that names one of the stage's methods: ``Annotated[Callable, Method()]``."""
+
+
+class PluginError(Exception):
+    """A plugin breaks the rules; the message says which and what would be right."""
+
+
+@dataclass(frozen=True)
+class Declares:
+    """The variables a stage touches, as survey paths (`b_raw`, `reference/total_field`, `current_*`).
+
+    needs: without them it cannot run.  uses: read where present.  gives: written.  may_give: written where
+    the input allows it (a loader cannot promise a temperature).
+    """
+
+    needs: tuple[str, ...] = ()
+    uses: tuple[str, ...] = ()
+    gives: tuple[str, ...] = ()
+    may_give: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Component:
+    """A marked function with what the engine must know of it."""
+
+    kind: str
+    name: str
+    function: Callable[..., Any]
+    declares: Declares | Callable[[Mapping[str, Any]], Declares] = Declares()
+    step: str = ""  # of a method: the stage it serves
+    source: str = ""  # paper and equations
+    suffixes: tuple[str, ...] = ()  # of a reader: the file names it recognises
+
+    @cached_property
+    def summary(self) -> str:
+        """The docstring's first paragraph on one line."""
+        doc = inspect.getdoc(self.function) or ""
+        return " ".join(doc.split("\n\n", 1)[0].split())
+
+    def declared(self, options: Mapping[str, Any]) -> Declares:
+        """What the stage touches when run with these options."""
+        return self.declares(options) if callable(self.declares) else self.declares
+
+    @cached_property
+    def parameters(self) -> dict[str, inspect.Parameter]:
+        """The keyword-only parameters: the options. Annotations are resolved."""
+        found = {}
+        for p in inspect.signature(self.function).parameters.values():
+            if p.kind is inspect.Parameter.VAR_KEYWORD:
+                raise PluginError(f"{self.kind} {self.name}: **{p.name} hides the options; name each of them")
+            if p.kind is not inspect.Parameter.KEYWORD_ONLY:
+                continue
+            if p.annotation is inspect.Parameter.empty:
+                raise PluginError(f"{self.kind} {self.name}: option {p.name} has no type")
+            annotation = p.annotation
+            if isinstance(annotation, str):
+                try:
+                    annotation = eval(annotation, getattr(self.function, "__globals__", {}))
+                except NameError as error:
+                    raise PluginError(f"{self.kind} {self.name}: type of option {p.name}: {error}") from error
+            found[p.name] = p.replace(annotation=annotation)
+        return found
+
+    @cached_property
+    def method_option(self) -> tuple[str, str | None] | None:
+        """The option that names a method, with its default; None for a stage without methods."""
+        for name, p in self.parameters.items():
+            if any(isinstance(a, Method) or a is Method for a in getattr(p.annotation, "__metadata__", ())):
+                return name, None if p.default is inspect.Parameter.empty else p.default
+        return None
+
+    @cached_property
+    def options(self) -> type[BaseModel]:
+        """The pydantic model of the options, the method's name left out."""
+        from pydantic import ConfigDict, create_model
+
+        chosen = self.method_option
+        fields: dict[str, Any] = {
+            name: (p.annotation, ... if p.default is inspect.Parameter.empty else p.default)
+            for name, p in self.parameters.items()
+            if chosen is None or name != chosen[0]
+        }
+        return create_model(
+            self.name, __config__=ConfigDict(extra="forbid", strict=True, arbitrary_types_allowed=True), **fields
+        )
+
+
+def _mark(kind: str, name: str | None, **facts: Any) -> Callable[[F], F]:
+    def decorate(function: F) -> F:
+        setattr(function, MARK, Component(kind, name or function.__name__, function, **facts))
+        return function
+
+    return decorate
+
+
+def stage(
+    *,
+    name: str | None = None,
+    needs: Iterable[str] = (),
+    uses: Iterable[str] = (),
+    gives: Iterable[str] = (),
+    may_give: Iterable[str] = (),
+    declares: Callable[[Mapping[str, Any]], Declares] | None = None,
+) -> Callable[[F], F]:
+    """Mark ``function(survey, *, options) -> {path: variable}`` as a stage.
+
+    The survey is read-only; what the function returns is merged into it by the runner, which checks both
+    against the declaration. `declares` replaces the four lists where they depend on the options.
+    """
+    return _mark(
+        "stage",
+        name,
+        declares=declares or Declares(tuple(needs), tuple(uses), tuple(gives), tuple(may_give)),
+    )
+
+
+def method(step: str, *, name: str | None = None, source: str = "") -> Callable[[F], F]:
+    """Mark a function as one of the methods of stage `step`; the stage documents the signature it calls."""
+    return _mark("method", name, step=step, source=source)
+
+
+def reader(*, name: str | None = None, suffixes: Iterable[str] = ()) -> Callable[[F], F]:
+    """Mark ``function(paths, *, options) -> RawTables`` as a file reader for these file-name endings."""
+    return _mark("reader", name, suffixes=tuple(suffixes))
+
+
+def metric(*, name: str | None = None, needs: Iterable[str] = (), uses: Iterable[str] = ()) -> Callable[[F], F]:
+    """Mark ``function(survey, *, options) -> list[Verdict]`` as a QC metric."""
+    return _mark("metric", name, declares=Declares(tuple(needs), tuple(uses)))
+
+
+def component_of(candidate: object) -> Component | None:
+    """The component a marked function carries, else None."""
+    found = getattr(candidate, MARK, None) if callable(candidate) else None
+    return found if isinstance(found, Component) else None
