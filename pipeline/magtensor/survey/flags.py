@@ -1,0 +1,73 @@
+"""The flag record: which samples are not used, who said so, and why. Flagged samples keep their values."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class Flag:
+    """A range of samples taken out of use.
+
+    Attributes:
+        start, stop: seconds on the survey's time axis, first and last flagged sample.
+        samples: how many samples the range holds.
+        sensor: the sensor's name, "" for the whole array.
+        by: the stage that set it.
+        reason: one clause.
+    """
+
+    start: float
+    stop: float
+    samples: int
+    sensor: str
+    by: str
+    reason: str
+
+    def as_dict(self) -> dict[str, object]:
+        return asdict(self)
+
+
+def flag_ranges(
+    time: NDArray[np.float64], bad: NDArray[np.bool_], *, by: str, reason: str, sensor: str = "", most: int = 1000
+) -> list[Flag]:
+    """One flag for each run of consecutive bad samples; beyond `most` runs the rest is one flag.
+
+    Args:
+        time: (N,) s.
+        bad: (N,) True where the sample is taken out of use.
+        by: the stage.
+        reason: one clause.
+        sensor: name, "" for the whole array.
+        most: runs recorded singly.
+    """
+    edges = np.flatnonzero(np.diff(np.concatenate(([False], bad, [False])).astype(np.int8)))
+    starts, stops = edges[0::2], edges[1::2]
+    flags = [
+        Flag(float(time[a]), float(time[b - 1]), int(b - a), sensor, by, reason)
+        for a, b in zip(starts[:most], stops[:most], strict=True)
+    ]
+    if len(starts) > most:
+        a, b = starts[most], stops[-1]
+        count = int(bad[a:].sum())
+        flags.append(
+            Flag(float(time[a]), float(time[b - 1]), count, sensor, by, f"{reason} (and {len(starts) - most} more runs)")
+        )
+    return flags
+
+
+def summary(flags: Iterable[Flag]) -> list[str]:
+    """One line for each pair of stage and reason: how many samples, of which sensors."""
+    groups: dict[tuple[str, str], list[Flag]] = {}
+    for flag in flags:
+        groups.setdefault((flag.by, flag.reason), []).append(flag)
+    lines = []
+    for (by, reason), members in groups.items():
+        sensors = sorted({m.sensor for m in members if m.sensor})
+        whose = f" of {', '.join(sensors)}" if sensors else ""
+        lines.append(f"{by}: {sum(m.samples for m in members)} samples{whose}: {reason}")
+    return lines
