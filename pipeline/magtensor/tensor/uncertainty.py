@@ -1,0 +1,145 @@
+"""Carry sensor noise and the uncertainty of the calibration through an assembly to the tensor."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magtensor.calibration.types import PARAMETERS_PER_SENSOR, ArrayCalibration
+from magtensor.errors import DataError
+from magtensor.tensor.assembly import Assembly, checked_noise_covariance
+from magtensor.tensor.elements import FIVE_OF_NINE
+
+Array = NDArray[np.float64]
+
+_UPPER = np.array([0, 1, 2, 4, 5, 8])  # of the nine elements row by row; the others mirror them
+_UPPER_OF_NINE = np.array([0, 1, 2, 1, 3, 4, 2, 4, 5])
+_CHUNK = 16384  # samples at a time: a few MB of scratch for any array
+
+
+def noise_covariance_of_components(assembly: Assembly, noise_covariance: Array) -> Array:
+    """Covariance (5, 5) in (nT/m)^2 of xx, xy, xz, yy, yz from sensor noise, the same at every sample.
+
+    Parameters
+    ----------
+    noise_covariance : (3 S, 3 S) or (S, 3, 3) nT^2, of the calibrated fields.
+    """
+    rows = _five_rows(assembly)
+    out: Array = rows @ checked_noise_covariance(noise_covariance, assembly.field_gain.shape[1]) @ rows.T
+    return out
+
+
+def noise_tensor_std(assembly: Assembly, noise_covariance: Array) -> Array:
+    """Standard deviation (3, 3) in nT/m of each element from sensor noise; NaN where it is not measured."""
+    rows = _nine_rows(assembly)
+    covariance = checked_noise_covariance(noise_covariance, assembly.field_gain.shape[1])
+    out: Array = np.sqrt(np.einsum("ap,pq,aq->a", rows, covariance, rows)).reshape(3, 3)
+    return out
+
+
+def component_covariance(
+    assembly: Assembly,
+    b: Array,
+    *,
+    noise_covariance: Array | None = None,
+    calibration: ArrayCalibration | None = None,
+) -> Array:
+    """Covariance (N, 5, 5) in (nT/m)^2 of the five components at every sample, noise and calibration added.
+
+    Takes 200 bytes per sample: give long records in pieces.
+
+    Parameters
+    ----------
+    b : (N, S, 3) nT, the calibrated fields.
+    noise_covariance : (3 S, 3 S) or (S, 3, 3) nT^2, of the calibrated fields.
+    calibration : the correction that made `b`, with its covariance. NaN in it makes the result NaN.
+    """
+    fields = assembly.checked_fields(b)
+    out = np.zeros((len(fields), 5, 5))
+    if noise_covariance is not None:
+        out += noise_covariance_of_components(assembly, noise_covariance)
+    if calibration is not None:
+        upper = np.triu_indices(5)
+        for part, values in _calibration_terms(_five_rows(assembly), upper, fields, calibration):
+            out[part, upper[0], upper[1]] += values
+            mirrored = upper[0] != upper[1]
+            out[part, upper[1][mirrored], upper[0][mirrored]] += values[:, mirrored]
+    return out
+
+
+def tensor_std(
+    assembly: Assembly,
+    b: Array,
+    *,
+    noise_covariance: Array | None = None,
+    calibration: ArrayCalibration | None = None,
+) -> Array:
+    """Standard deviation (N, 3, 3) in nT/m of every element at every sample, noise and calibration added.
+
+    Parameters as in `component_covariance`; works through any number of samples in pieces.
+    """
+    fields = assembly.checked_fields(b)
+    variance = np.zeros((len(fields), 9))
+    if noise_covariance is not None:
+        variance += noise_tensor_std(assembly, noise_covariance).ravel() ** 2
+    if calibration is not None:
+        distinct = _UPPER if assembly.symmetric else np.arange(9)
+        copies = _UPPER_OF_NINE if assembly.symmetric else np.arange(9)
+        each = np.arange(len(distinct))
+        rows = _nine_rows(assembly)[distinct]
+        for part, values in _calibration_terms(rows, (each, each), fields, calibration):
+            variance[part] += np.maximum(values, 0)[:, copies]  # rounding can make a zero variance negative
+    out: Array = np.sqrt(variance).reshape(-1, 3, 3)
+    return out
+
+
+def _nine_rows(assembly: Assembly) -> Array:
+    out: Array = assembly.gain.reshape(9, -1)
+    return out
+
+
+def _five_rows(assembly: Assembly) -> Array:
+    out: Array = FIVE_OF_NINE @ _nine_rows(assembly)
+    return out
+
+
+def _calibration_terms(
+    rows: Array, pairs: tuple[NDArray[np.int_], ...], fields: Array, calibration: ArrayCalibration
+) -> Iterator[tuple[slice, Array]]:
+    """Yield (slice of samples, (n, pairs) covariance of rows[p] b and rows[q] b that the calibration causes).
+
+    With b = M (m - o), d(row b) is linear in z = (m - o, 1) and in the parameters: row' db = z' E dp. So the
+    covariance of two rows is the quadratic form z' (E_p C E_q') z, of one small matrix for all samples.
+    """
+    sensors = fields.shape[1]
+    size = PARAMETERS_PER_SENSOR * sensors
+    covariance = np.asarray(calibration.covariance, dtype=float)
+    if covariance.shape != (size, size) or calibration.matrix.shape != (sensors, 3, 3):
+        raise DataError(
+            f"the calibration has {len(calibration.matrix)} sensors, its covariance shape {covariance.shape}",
+            where="calibration",
+            hint=f"{sensors} sensors and a covariance ({size}, {size}) are right for this array",
+        )
+    inverse = np.linalg.inv(calibration.matrix)
+    influence = np.stack([_influence(row.reshape(sensors, 3), calibration.matrix) for row in rows])
+    forms = np.stack([influence[p] @ covariance @ influence[q].T for p, q in zip(*pairs, strict=True)])
+    for start in range(0, len(fields), _CHUNK):
+        part = slice(start, start + _CHUNK)
+        raw = np.einsum("sij,nsj->nsi", inverse, fields[part])
+        z = np.concatenate([raw.reshape(len(raw), -1), np.ones((len(raw), 1))], axis=1)
+        yield part, np.stack([np.einsum("np,np->n", z @ form, z) for form in forms], axis=1)
+
+
+def _influence(row: Array, matrix: Array) -> Array:
+    """E (3 S + 1, 12 S) for one row of gains (S, 3)."""
+    sensors = len(row)
+    out = np.zeros((3 * sensors + 1, PARAMETERS_PER_SENSOR * sensors))
+    for s in range(sensors):
+        first = PARAMETERS_PER_SENSOR * s
+        for i in range(3):
+            for j in range(3):
+                out[3 * s + j, first + 3 * i + j] = row[s, i]
+        out[-1, first + 9 : first + 12] = -row[s] @ matrix[s]
+    return out
