@@ -1,1 +1,2 @@
 
+from magtensor_stages.load import load as load

@@ -21,6 +21,8 @@ from magtensor.survey.flags import Flag
 if TYPE_CHECKING:
     import xarray as xr
 
+    from magtensor.survey.source import Source
+
 # What a stage may return for a path: a DataArray, or (dims, values, attributes).
 Variable: TypeAlias = "xr.DataArray | tuple[Sequence[str], Any, Mapping[str, Any]]"
 
@@ -46,11 +48,13 @@ class Survey:
         tree: the DataTree.
         flags: the flag record so far.
         attributes: facts of the whole survey (title, instrument, source file, ...).
+        source: where the stage `load` reads it from; None for a survey made in memory.
     """
 
     tree: xr.DataTree
     flags: tuple[Flag, ...] = ()
     attributes: Mapping[str, Any] = field(default_factory=dict)
+    source: Source | None = None
 
     @classmethod
     def build(cls, variables: Mapping[str, Variable], attributes: Mapping[str, Any] | None = None) -> Survey:
@@ -83,7 +87,8 @@ class Survey:
                 for dim in used & set(nodes["array"].coords) - set(dataset.coords) - set(added):
                     dataset = dataset.assign_coords({dim: nodes["array"].coords[dim]})
             nodes[node] = dataset.drop_vars([n for n in added if n in dataset]).assign(added)
-        return Survey(xr.DataTree.from_dict({f"/{n}": d for n, d in nodes.items()}), (*self.flags, *flags), self.attributes)
+        tree = xr.DataTree.from_dict({f"/{n}": d for n, d in nodes.items()})
+        return Survey(tree, (*self.flags, *flags), self.attributes, self.source)
 
     def paths(self) -> list[str]:
         """Every variable and coordinate, sorted."""
