@@ -10,15 +10,27 @@ _LAZY = {
     "method": "magtensor.components",
     "reader": "magtensor.components",
     "metric": "magtensor.components",
-    "Method": "magtensor.components",
+    "MethodChoice": "magtensor.components",
+    "MetricsChoice": "magtensor.components",
     "DataError": "magtensor.errors",
     "UsageError": "magtensor.errors",
     "NotEnoughData": "magtensor.errors",
 }
-__all__ = ["DataError", "Method", "NotEnoughData", "UsageError", "__version__", "method", "metric", "reader", "stage"]
+__all__ = [
+    "DataError",
+    "MethodChoice",
+    "MetricsChoice",
+    "NotEnoughData",
+    "UsageError",
+    "__version__",
+    "method",
+    "metric",
+    "reader",
+    "stage",
+]
 
 if TYPE_CHECKING:
-    from magtensor.components import Method, method, metric, reader, stage
+    from magtensor.components import MethodChoice, MetricsChoice, method, metric, reader, stage
     from magtensor.errors import DataError, NotEnoughData, UsageError
 
 

@@ -15,7 +15,7 @@ import inspect
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 if TYPE_CHECKING:
     from pydantic import BaseModel
@@ -27,7 +27,17 @@ KINDS = ("stage", "method", "reader", "metric")
 
 
 class Method:
-    """Marks the option of a stage that names one of the stage's methods: ``Annotated[Callable, Method()]``."""
+    """Marks the option of a stage that names one of the stage's methods; see `MethodChoice`."""
+
+
+class Metrics:
+    """Marks the option of a stage that names metrics; see `MetricsChoice`."""
+
+
+MethodChoice = Annotated[
+    Any, Method()
+]  # a name in the recipe, the method's function with its options bound in the stage
+MetricsChoice = Annotated[Any, Metrics()]  # names in the recipe, {name: function} in the stage
 
 
 class PluginError(Exception):
@@ -90,24 +100,36 @@ class Component:
             found[p.name] = p.replace(annotation=annotation)
         return found
 
-    @cached_property
-    def method_option(self) -> tuple[str, str | None] | None:
-        """The option that names a method, with its default; None for a stage without methods."""
+    def _marked_with(self, marker: type) -> str | None:
         for name, p in self.parameters.items():
-            if any(isinstance(a, Method) or a is Method for a in getattr(p.annotation, "__metadata__", ())):
-                return name, None if p.default is inspect.Parameter.empty else p.default
+            if any(isinstance(a, marker) for a in getattr(p.annotation, "__metadata__", ())):
+                return name
         return None
 
     @cached_property
+    def metrics_option(self) -> str | None:
+        """The option that names metrics; None for a stage without."""
+        return self._marked_with(Metrics)
+
+    @cached_property
+    def method_option(self) -> tuple[str, str | None] | None:
+        """The option that names a method, with its default; None for a stage without methods."""
+        name = self._marked_with(Method)
+        if name is None:
+            return None
+        default = self.parameters[name].default
+        return name, None if default is inspect.Parameter.empty else default
+
+    @cached_property
     def options(self) -> type[BaseModel]:
-        """The pydantic model of the options, the method's name left out."""
+        """The pydantic model of the options, those that name methods or metrics left out."""
         from pydantic import ConfigDict, create_model
 
-        chosen = self.method_option
+        components = {self.metrics_option, self.method_option[0] if self.method_option else None}
         fields: dict[str, Any] = {
             name: (p.annotation, ... if p.default is inspect.Parameter.empty else p.default)
             for name, p in self.parameters.items()
-            if chosen is None or name != chosen[0]
+            if name not in components
         }
         return create_model(
             self.name, __config__=ConfigDict(extra="forbid", strict=True, arbitrary_types_allowed=True), **fields

@@ -1,2 +1,8 @@
+"""Built-in stages; every marked function named here is found by the engine."""
 
+from magtensor_stages.array import align as align
+from magtensor_stages.array import assemble_tensor as assemble_tensor
 from magtensor_stages.load import load as load
+from magtensor_stages.quality import qc as qc
+from magtensor_stages.sensors import calibrate_array as calibrate_array
+from magtensor_stages.sensors import calibrate_scalar as calibrate_scalar

@@ -1,0 +1,52 @@
+"""The error figures of a calibrated survey: one block, made the same way for every survey and every report."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from magtensor.calibration.types import Array
+
+COMPONENTS = ("xx", "xy", "xz", "yy", "yz", "zz")
+_INDEX = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+
+
+def error_block(
+    b: Array, total_field: Array | None, tensor: Array | None, good: np.ndarray, sensors: list[str]
+) -> dict[str, Any]:
+    """Error figures over the samples in use, where the survey was taken in a uniform field.
+
+    Args:
+        b: (N, S, 3) nT calibrated.
+        total_field: (N,) nT reference; None where there is none.
+        tensor: (N, 3, 3) nT/m; None with fewer than three sensors.
+        good: (N, S) samples in use.
+        sensors: names.
+
+    Returns:
+        `total_field_rms_nT` per sensor and `all`, `tensor_rms_nT_per_m` per component and `all` (rms over the nine
+        entries), `invariant_rms` of I1 and I2, `samples`. A figure that the survey cannot give is None.
+    """
+    use = good.all(axis=1)
+    block: dict[str, Any] = {"total_field_rms_nT": None, "tensor_rms_nT_per_m": None, "invariant_rms": None}
+    if total_field is not None:
+        residual = np.linalg.norm(b, axis=2) - total_field[:, None]
+        known = good & np.isfinite(residual)
+        figures = {s: rms(residual[known[:, i], i]) for i, s in enumerate(sensors)}
+        block["total_field_rms_nT"] = figures | {"all": rms(residual[known])}
+        use = use & np.isfinite(total_field)
+    if tensor is not None:
+        g = tensor[use & np.isfinite(tensor).all(axis=(1, 2))]
+        parts = {f"{n}": rms(g[:, i, j]) for n, (i, j) in zip(COMPONENTS, _INDEX, strict=True)}
+        block["tensor_rms_nT_per_m"] = parts | {"all": rms(g)}
+        block["invariant_rms"] = {
+            "I1_nT2_per_m2": rms(-0.5 * np.einsum("nij,nij->n", g, g)),
+            "I2_nT3_per_m3": rms(np.linalg.det(g)) if len(g) else None,
+        }
+    return block | {"samples": int(use.sum())}
+
+
+def rms(values: Array) -> float | None:
+    """Root mean square; None of nothing."""
+    return float(np.sqrt(np.mean(np.square(values)))) if values.size else None

@@ -1,0 +1,109 @@
+"""Between the mathematics of a calibration and the survey's variables: one place that stores and applies it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from magtensor.calibration.types import ArrayCalibration
+from magtensor.errors import DataError
+from magtensor.survey.model import AXES, Survey, Variable
+
+MATRIX_ENTRIES = tuple(f"matrix_{i}{j}" for i in AXES for j in AXES)
+OFFSET_ENTRIES = tuple(f"offset_{j}" for j in AXES)
+
+B = ("time", "sensor", "axis")
+
+
+def stored(calibration: ArrayCalibration, sensors: list[str], **facts: Any) -> dict[str, Variable]:
+    """A calibration as the variables of the group `calibration`.
+
+    `matrix` (sensor, axis, raw_axis), `offset` (sensor, raw_axis) nT, `covariance` (parameter, parameter) with
+    the parameters named `<sensor>:matrix_xx` ... `<sensor>:offset_z`; the frame and what is unobservable are
+    attributes of `matrix`.
+    """
+    names = [f"{s}:{e}" for s in sensors for e in (*MATRIX_ENTRIES, *OFFSET_ENTRIES)]
+    attributes = {
+        "units": "1",
+        "frame": calibration.frame,
+        "unobservable": json.dumps(list(calibration.unobservable)),
+        "diagnostics": json.dumps(calibration.diagnostics, default=float),
+        "long_name": "correction matrix: b = matrix (raw - offset)",
+    } | facts
+    return {
+        "calibration/raw_axis": (("raw_axis",), np.array(AXES), {"long_name": "axis of the raw output"}),
+        "calibration/parameter": (("parameter",), np.array(names), {}),
+        "calibration/matrix": (("sensor", "axis", "raw_axis"), calibration.matrix, attributes),
+        "calibration/offset": (("sensor", "raw_axis"), calibration.offset, {"units": "nT", "long_name": "offset in raw output"}),
+        "calibration/covariance": (
+            ("parameter", "parameter_"), calibration.covariance,
+            {"units": "products of the parameters' units (1, nT)", "long_name": "covariance of the parameters"},
+        ),
+    }  # fmt: skip
+
+
+def restored(survey: Survey) -> ArrayCalibration:
+    """The calibration that `stored` put into a survey."""
+    matrix = survey["calibration/matrix"]
+    return ArrayCalibration(
+        np.asarray(matrix.values, dtype=float),
+        np.asarray(survey.values("calibration/offset"), dtype=float),
+        np.asarray(survey.values("calibration/covariance"), dtype=float),
+        str(matrix.attrs["frame"]),
+        tuple(json.loads(matrix.attrs["unobservable"])),
+        json.loads(matrix.attrs["diagnostics"]),
+    )
+
+
+def corrected(calibration: ArrayCalibration, survey: Survey) -> dict[str, Variable]:
+    """`calibrated/b` and, where the total field is known, `residual/total_field` and what it was before, for every sample."""
+    raw = np.asarray(survey.values("b_raw"), dtype=float)
+    b = calibration.apply(raw)
+    given: dict[str, Variable] = {
+        "calibrated/b": (B, b, {"units": "nT", "frame": calibration.frame, "long_name": "calibrated field"})
+    }
+    if "total_field" in survey:
+        reference = survey.values("total_field")[:, None]
+        for name, field in (("total_field", b), ("total_field_before", raw)):
+            long_name = f"|{'b' if field is b else 'b_raw'}| - total field"
+            residual = np.linalg.norm(field, axis=2) - reference
+            given[f"residual/{name}"] = (("time", "sensor"), residual, {"units": "nT", "long_name": long_name})
+    return given
+
+
+def contrasts(b: np.ndarray) -> dict[str, Variable]:
+    """`residual/contrast`: each sensor's field less the mean of all, nT; zero in a uniform field."""
+    values = b - b.mean(axis=1, keepdims=True)
+    return {"residual/contrast": (B, values, {"units": "nT", "long_name": "sensor less the mean of all sensors"})}
+
+
+def require_sensors(survey: Survey, wanted: list[str], where: str) -> None:
+    """A calibration fits only the sensors it was made from, in their order.
+
+    Raises:
+        DataError: the survey has other sensors.
+    """
+    if survey.sensors != wanted:
+        raise DataError(
+            f"the calibration is for the sensors {', '.join(wanted)}, the survey has {', '.join(survey.sensors)}",
+            where=where,
+            hint="name the calibration that was made with these sensors, or rename them in the recipe's mapping",
+        )
+
+
+def plain_attributes(attributes: Mapping[str, Any]) -> dict[str, Any]:
+    """Attributes that netCDF can hold: text, numbers and arrays of them; the rest as JSON text."""
+    plain: dict[str, Any] = {}
+    for key, value in attributes.items():
+        if isinstance(value, (bool, np.bool_)):
+            plain[key] = int(value)
+        elif value is None:
+            continue
+        elif isinstance(value, (str, int, float, np.integer, np.floating, np.ndarray)):
+            plain[key] = value
+        else:
+            plain[key] = json.dumps(value, default=str)
+    return plain

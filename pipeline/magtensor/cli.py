@@ -1,0 +1,201 @@
+"""The command line. Imports are inside the commands: `magtensor --help` must answer at once."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import click
+
+from magtensor import __version__
+from magtensor.errors import MagtensorError
+
+FILE = click.Path(path_type=Path, dir_okay=False)
+FOLDER = click.Path(path_type=Path, file_okay=False)
+plugins_option = click.option(
+    "--plugins", "plugin_folders", type=click.Path(path_type=Path), multiple=True, metavar="FOLDER",
+    help="A folder of single-file plugins (or one such file); may be given several times.",
+)  # fmt: skip
+set_option = click.option(
+    "--set", "overrides", multiple=True, metavar="PATH=VALUE",
+    help="Change one value of the recipe, e.g. stages.align.to=S2; may be given several times.",
+)  # fmt: skip
+
+
+@click.group(context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(__version__, prog_name="magtensor")
+def cli() -> None:
+    """Calibrate magnetic gradient tensor systems with declarative recipes."""
+
+
+@cli.command()
+@click.argument("recipe", type=FILE)
+@click.option("--input", "survey", type=FILE, help="The survey, in place of the recipe's own.")
+@click.option("--verify", type=FILE, help="A second survey in a uniform field; its error goes into the verdict.")
+@click.option("--output", type=FOLDER, help="Folder for the results; default: the recipe's name with .result.")
+@set_option
+@plugins_option
+def run(
+    recipe: Path,
+    survey: Path | None,
+    verify: Path | None,
+    output: Path | None,
+    overrides: tuple[str, ...],
+    plugin_folders: tuple[Path, ...],
+) -> None:
+    """Run RECIPE on a survey, or a result.nc again from its own provenance."""
+    from magtensor.session import run_recipe
+
+    directory = output or Path(f"{recipe.stem}.result")
+    finished = run_recipe(
+        recipe, directory, survey=survey, verify=verify, overrides=overrides, plugin_folders=plugin_folders,
+        progress=_progress(),
+    )  # fmt: skip
+    _progress_end()
+    for note in finished.notes:
+        click.echo(note)
+    click.echo(f"results: {directory / 'result.nc'}")
+    if (directory / "report.html").is_file():
+        click.echo(f"report:  {directory / 'report.html'}")
+    else:
+        click.echo("report:  not written; it needs matplotlib and jinja2: pip install 'magtensor[report]'")
+    click.echo(finished.sentence)
+
+
+@cli.command()
+@click.argument("calibration", type=FILE)
+@click.argument("survey", type=FILE)
+@click.option("--output", type=FILE, help="Default: the survey's name with .calibrated.nc.")
+def apply(calibration: Path, survey: Path, output: Path | None) -> None:
+    """Apply a stored CALIBRATION to another SURVEY."""
+    from magtensor import session
+
+    click.echo(f"calibrated: {session.apply(calibration, survey, output)}")
+
+
+@cli.command()
+@click.argument("recipe", type=FILE)
+@click.argument("surveys", type=click.Path(path_type=Path), nargs=-1, required=True)
+@click.option("--output", type=FOLDER, required=True, help="Folder; each survey gets a folder of its own in it.")
+@click.option("--workers", type=click.IntRange(1), default=None, help="Processes; default: one per core.")
+@click.option("--scheduler", metavar="ADDRESS", help="A Dask scheduler in place of local processes.")
+@set_option
+@plugins_option
+def batch(
+    recipe: Path,
+    surveys: tuple[Path, ...],
+    output: Path,
+    workers: int | None,
+    scheduler: str | None,
+    overrides: tuple[str, ...],
+    plugin_folders: tuple[Path, ...],
+) -> None:
+    """Run RECIPE on many SURVEYS; what is done already is not done again."""
+    from magtensor.batch import run_batch
+
+    summary = run_batch(
+        recipe, surveys, output, workers=workers, scheduler=scheduler, overrides=overrides,
+        plugin_folders=plugin_folders, say=click.echo,
+    )  # fmt: skip
+    click.echo(summary.sentence)
+    summary.raise_if_failed()
+
+
+@cli.command()
+@click.argument("recipe", type=FILE)
+@click.option("--input", "survey", type=FILE, help="The survey, in place of the recipe's own.")
+@set_option
+@plugins_option
+def validate(recipe: Path, survey: Path | None, overrides: tuple[str, ...], plugin_folders: tuple[Path, ...]) -> None:
+    """Check RECIPE completely without reading any data."""
+    from magtensor.recipe.plan import read_plan
+
+    planned = read_plan(recipe, overrides=overrides, plugin_folders=plugin_folders, survey=survey)
+    click.echo(f"{recipe}: valid; {len(planned.stages)} stages: {', '.join(s.name for s in planned.stages)}")
+
+
+@cli.command()
+@click.argument("file", type=FILE)
+@click.option("--reader", help="The reader plugin; default: by the file name's ending.")
+def inspect(file: Path, reader: str | None) -> None:
+    """Show what FILE holds, and propose a mapping for a recipe."""
+    from magtensor.survey.inspect import show
+
+    show(file, reader)
+
+
+@cli.command()
+@click.option("--json", "as_json", is_flag=True, help="Print as JSON, option schemas included.")
+@click.argument("name", required=False)
+@plugins_option
+def plugins(as_json: bool, name: str | None, plugin_folders: tuple[Path, ...]) -> None:
+    """List every plugin and what it gives; with NAME, one stage, method, reader or metric in full."""
+    from magtensor.listing import describe, show_one, show_plugins
+    from magtensor.registry import Registry
+
+    registry = Registry.load(plugin_folders)
+    if as_json:
+        click.echo(json.dumps(describe(registry), indent=2))
+    elif name:
+        show_one(registry, name)
+    else:
+        show_plugins(registry)
+    registry.check()
+
+
+@cli.command()
+@click.argument("scenario", type=FILE)
+@click.option("--output", type=FILE, required=True, help="The survey file to write.")
+@click.option("--set", "overrides", multiple=True, metavar="PATH=VALUE", help="Change one value of the scenario.")
+def simulate(scenario: Path, output: Path, overrides: tuple[str, ...]) -> None:
+    """Simulate the survey that SCENARIO describes, in the canonical layout."""
+    from magtensor.simulate.command import simulate_file
+
+    click.echo(simulate_file(scenario, output, overrides))
+
+
+@cli.command()
+@click.argument("directory", type=FOLDER)
+def report(directory: Path) -> None:
+    """Write report.html anew from the results in DIRECTORY."""
+    from magtensor.report import write_report
+
+    click.echo(f"report: {write_report(directory, required=True)}")
+
+
+def _progress() -> Any:
+    if not sys.stderr.isatty():
+        return None
+
+    def show(stage: str) -> None:
+        click.echo(f"\r\033[K{stage} ...", nl=False, err=True)
+
+    return show
+
+
+def _progress_end() -> None:
+    if sys.stderr.isatty():
+        click.echo("\r\033[K", nl=False, err=True)
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run the command line and leave with the exit status of the contract."""
+    sys.exit(status_of(arguments))
+
+
+def status_of(arguments: list[str] | None = None) -> int:
+    """Run the command line; a user's mistake is one message, a bug keeps its traceback (exit status 1)."""
+    try:
+        outcome = cli.main(args=arguments, prog_name="magtensor", standalone_mode=False)
+    except click.ClickException as error:
+        error.show()
+        return 2
+    except click.Abort:
+        return 130
+    except MagtensorError as error:
+        _progress_end()
+        click.echo(f"error: {error}", err=True)
+        return error.exit_status
+    return outcome if isinstance(outcome, int) else 0

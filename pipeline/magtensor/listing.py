@@ -1,0 +1,125 @@
+"""What is installed, for people and for programs: every plugin, what it gives, and each option with its meaning."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+from magtensor.components import Component
+from magtensor.errors import UsageError, did_you_mean
+from magtensor.registry import Plugin, Registry
+
+
+def describe(registry: Registry) -> dict[str, Any]:
+    """All of it as plain data; the options of each component as JSON schema."""
+    return {
+        "plugins": [p.as_dict() | {"gives": [_label(c) for c in registry.by_plugin(p)]} for p in registry.plugins],
+        "components": [_described(registry, c) for _, c in sorted(registry.components.items())],
+        "problems": registry.problems,
+    }
+
+
+def _described(registry: Registry, component: Component) -> dict[str, Any]:
+    facts: dict[str, Any] = {
+        "kind": component.kind,
+        "name": component.name,
+        "summary": component.summary,
+        "plugin": registry.origin[(component.kind, component.step, component.name)].origin,
+        "options": component.options.model_json_schema(),
+    }
+    if component.kind == "method":
+        facts |= {"stage": component.step, "source": component.source}
+    if component.kind == "stage":
+        if callable(component.declares):
+            facts["variables"] = "depend on the options"
+        else:
+            declares = component.declares
+            facts |= {
+                "needs": declares.needs,
+                "uses": declares.uses,
+                "gives": declares.gives,
+                "may_give": declares.may_give,
+            }
+        facts["methods"] = registry.names("method", component.name)
+    if component.suffixes:
+        facts["suffixes"] = component.suffixes
+    return facts
+
+
+def _label(component: Component) -> str:
+    return f"{component.step}: {component.name}" if component.step else component.name
+
+
+def show_plugins(registry: Registry) -> None:
+    """Print a table of plugins, then one of components."""
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console()
+    table = Table(title="plugins", title_justify="left")
+    for column in ("name", "from", "version", "state"):
+        table.add_column(column, overflow="fold")
+    for plugin in registry.plugins:
+        origin = str(plugin.file) if plugin.file else plugin.distribution
+        version = plugin.sha256[:12] if plugin.file else plugin.version
+        table.add_row(plugin.name, origin, version, _state(registry, plugin))
+    console.print(table)
+    components = Table(title="what they give", title_justify="left")
+    for column in ("kind", "name", "what it does"):
+        components.add_column(column, overflow="fold")
+    for (kind, step, name), component in sorted(registry.components.items()):
+        components.add_row(f"{kind} of {step}" if step else kind, name, component.summary)
+    console.print(components)
+
+
+def _state(registry: Registry, plugin: Plugin) -> str:
+    return f"broken: {plugin.error}" if plugin.error else f"{len(registry.by_plugin(plugin))} components"
+
+
+def show_one(registry: Registry, name: str) -> None:
+    """Print every component of that name in full.
+
+    Raises:
+        UsageError: there is none.
+    """
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    found = [(key, c) for key, c in sorted(registry.components.items()) if c.name == name]
+    if not found:
+        names = {n for _, _, n in registry.components}
+        raise UsageError(f"no component is called {name!r}{did_you_mean(name, names)}")
+    console = Console()
+    for (kind, step, _), component in found:
+        console.print(f"[bold]{kind} {name}[/bold]" + (f" of {step}" if step else ""))
+        console.print(escape((component.function.__doc__ or "").strip()))
+        if component.source:
+            console.print(f"source: {escape(component.source)}")
+        console.print(f"from {registry.origin[(kind, step, name)].origin}")
+        if kind == "stage" and not callable(component.declares):
+            for word in ("needs", "uses", "gives", "may_give"):
+                if paths := getattr(component.declares, word):
+                    console.print(f"{word.replace('_', ' ')}: {', '.join(paths)}")
+        if methods := registry.names("method", name) if kind == "stage" else []:
+            console.print(f"methods: {', '.join(methods)}")
+        table = Table()
+        for column in ("option", "type", "default", "meaning"):
+            table.add_column(column, overflow="fold")
+        schema = component.options.model_json_schema()
+        required = schema.get("required", [])
+        for option, facts in schema.get("properties", {}).items():
+            default = "required" if option in required else json.dumps(facts.get("default"))
+            table.add_row(option, escape(_type(facts)), escape(default), escape(facts.get("description", "")))
+        if table.row_count:
+            console.print(table)
+
+
+def _type(facts: dict[str, Any]) -> str:
+    if "enum" in facts:
+        return " | ".join(str(v) for v in facts["enum"])
+    if "anyOf" in facts:
+        return " | ".join(_type(f) for f in facts["anyOf"])
+    limits = {"minimum": ">=", "exclusiveMinimum": ">", "maximum": "<=", "exclusiveMaximum": "<"}
+    bounds = [f"{sign} {facts[key]:g}" for key, sign in limits.items() if key in facts]
+    return " ".join([str(facts.get("const", facts.get("type", "any"))), *bounds])

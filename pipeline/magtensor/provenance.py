@@ -1,0 +1,176 @@
+"""Where a result comes from: enough to make it again and get the same bits on the same machine."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.metadata
+import json
+import platform
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import magtensor
+from magtensor.errors import DataError, UsageError
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from magtensor.recipe.plan import Plan
+    from magtensor.runner import StageRecord
+
+LIBRARIES = ("numpy", "scipy", "h5py", "h5netcdf", "xarray", "pydantic", "pluggy", "pyyaml")
+GROUP = "provenance"
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """What made a result.
+
+    Attributes:
+        recipe: the resolved recipe, every default written out.
+        inputs: path, SHA-256 and size of each file read.
+        versions: of the package, Python and the libraries.
+        plugins: distribution and version, or file and SHA-256, of each plugin that took part.
+        stages: what each stage did, in order.
+        content_sha256: over every array of the result but this group.
+    """
+
+    recipe: Mapping[str, Any]
+    inputs: Sequence[Mapping[str, Any]]
+    versions: Mapping[str, str]
+    plugins: Sequence[Mapping[str, str]]
+    stages: Sequence[Mapping[str, Any]]
+    content_sha256: str = ""
+    notes: Mapping[str, str] = field(default_factory=dict)
+
+    def attributes(self) -> dict[str, str]:
+        """As the attributes of the group `/provenance`, each JSON text (the content hash bare)."""
+        parts = {k: getattr(self, k) for k in ("recipe", "inputs", "versions", "plugins", "stages", "notes")}
+        return {k: json.dumps(v, indent=1, default=str) for k, v in parts.items()} | {
+            "content_sha256": self.content_sha256
+        }
+
+    @classmethod
+    def from_attributes(cls, attributes: Mapping[str, Any]) -> Provenance:
+        """The inverse of `attributes`."""
+        parts = {k: json.loads(attributes[k]) for k in ("recipe", "inputs", "versions", "plugins", "stages", "notes")}
+        return cls(**parts, content_sha256=str(attributes["content_sha256"]))
+
+
+def collect(plan: Plan, records: Iterable[StageRecord], inputs: Iterable[Path]) -> Provenance:
+    """The provenance of a run that succeeded."""
+    used = {id(c) for stage in plan.stages for c in stage.uses}
+    readers = {key for key in plan.registry.components if key[0] == "reader"}
+    plugins = {
+        plan.registry.origin[key].origin: plan.registry.origin[key].as_dict()
+        for key, component in plan.registry.components.items()
+        if id(component) in used or key in readers
+    }
+    return Provenance(
+        recipe=plan.resolved(),
+        inputs=[file_facts(p) for p in inputs],
+        versions=versions(),
+        plugins=list(plugins.values()),
+        stages=[r.as_dict() for r in records],
+        notes={"recipe_file": plan.file, "folder": str(plan.folder.resolve())},
+    )
+
+
+def versions() -> dict[str, str]:
+    """Versions of the package, Python and the libraries."""
+    found = {"magtensor": magtensor.__version__, "python": platform.python_version()}
+    for library in LIBRARIES:
+        found[library] = importlib.metadata.version(library)
+    return found
+
+
+def file_facts(path: Path) -> dict[str, Any]:
+    """Path, SHA-256 and size of a file."""
+    path = Path(path)
+    return {"path": str(path.resolve()), "sha256": sha256(path), "bytes": path.stat().st_size}
+
+
+def sha256(path: Path) -> str:
+    """SHA-256 of a file, hexadecimal."""
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def content_sha256(tree: xr.DataTree) -> str:
+    """SHA-256 over every variable's path, type, shape and bytes, `/provenance` left out."""
+    import numpy as np
+
+    digest = hashlib.sha256()
+    for node in sorted(tree.subtree, key=lambda n: n.path):
+        if node.path.startswith(f"/{GROUP}"):
+            continue
+        dataset = node.to_dataset(inherit=False)
+        for name in sorted(str(v) for v in dataset.variables):
+            values = np.asarray(dataset[name].values)
+            if values.dtype.kind in "OUST":
+                values = np.asarray([str(v) for v in values.ravel()], dtype="U").reshape(values.shape)
+                content = "\0".join(values.ravel().tolist()).encode()
+            else:
+                if values.dtype.kind == "b":
+                    values = values.astype("int8")
+                content = np.ascontiguousarray(values).tobytes()
+            digest.update(f"{node.path}/{name}:{values.shape}:{values.dtype.kind}".encode())
+            digest.update(content)
+    return digest.hexdigest()
+
+
+def read(path: Path) -> Provenance:
+    """The provenance of a result or calibration file.
+
+    Raises:
+        UsageError: the file is not there, is no HDF5, or carries no provenance.
+    """
+    import h5py
+
+    try:
+        with h5py.File(path, "r") as file:
+            if GROUP not in file:
+                raise UsageError(f"{path}: has no group /{GROUP}; only results of magtensor can be run again")
+            return Provenance.from_attributes(dict(file[GROUP].attrs))
+    except OSError as error:
+        raise UsageError(f"{path}: cannot be read as HDF5: {error}") from error
+    except (KeyError, ValueError) as error:
+        raise UsageError(f"{path}: its /{GROUP} is damaged: {error}") from error
+
+
+def check_inputs(provenance: Provenance) -> None:
+    """The inputs are still what they were.
+
+    Raises:
+        DataError: a file is gone or has changed.
+    """
+    for entry in provenance.inputs:
+        path = Path(entry["path"])
+        if not path.is_file():
+            raise DataError("an input of this result is no longer there", where=str(path), hint="name it with --input")
+        if sha256(path) != entry["sha256"]:
+            raise DataError(
+                "this input has changed since the result was made",
+                where=str(path),
+                hint=f"its SHA-256 was {entry['sha256']}; name the original with --input",
+            )
+
+
+def differences(then: Provenance, now: Provenance) -> list[str]:
+    """In words, what is not as it was: versions of the package, the libraries and the plugins."""
+    lines = [
+        f"{name} was {old}, is {now.versions.get(name, 'not there')}"
+        for name, old in then.versions.items()
+        if now.versions.get(name) != old
+    ]
+    current = {p["name"]: p for p in now.plugins}
+    for plugin in then.plugins:
+        name = plugin["name"]
+        for key in ("version", "sha256"):
+            if key in plugin and current.get(name, {}).get(key) != plugin[key]:
+                lines.append(
+                    f"plugin {name}: {key} was {plugin[key]}, is {current.get(name, {}).get(key, 'not there')}"
+                )
+    return lines

@@ -1,0 +1,448 @@
+"""From a recipe to a plan: every option checked, every variable accounted for, before any data are read."""
+
+from __future__ import annotations
+
+import copy
+import functools
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Any
+
+from magtensor.components import Component, Declares
+from magtensor.errors import UsageError, did_you_mean
+from magtensor.recipe.problems import Problems
+from magtensor.recipe.source import Document, Location, load_yaml, parse_scalar
+from magtensor.registry import Registry
+from magtensor.survey.sections import SurveySection
+from magtensor.survey.source import Source
+
+TOP_KEYS = ("title", "description", "authors", "references", "survey", "plugins", "stages")
+
+
+@dataclass(frozen=True)
+class PlannedStage:
+    """A stage with its options bound.
+
+    Attributes:
+        component: the stage.
+        options: what its function is called with; methods and metrics as callables.
+        described: the same as plain data with every default written out, for provenance.
+        declares: the variables it touches with these options.
+        uses: every component that takes part (the stage, its method, its metrics).
+    """
+
+    component: Component
+    options: Mapping[str, Any]
+    described: Mapping[str, Any]
+    declares: Declares
+    uses: tuple[Component, ...]
+
+    @property
+    def name(self) -> str:
+        return self.component.name
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A recipe that can run.
+
+    Attributes:
+        title, description, authors, references: as the recipe says.
+        survey: the survey section; None where the command line must name the survey.
+        stages: in the recipe's order.
+        registry: the plugins it was made with.
+        folder: what relative paths are relative to.
+        file: the recipe's file, for messages.
+    """
+
+    title: str
+    description: str
+    authors: tuple[str, ...]
+    references: tuple[str, ...]
+    survey: SurveySection | None
+    stages: tuple[PlannedStage, ...]
+    registry: Registry
+    folder: Path
+    file: str
+    plugins: tuple[str, ...] = ()
+
+    def source(self) -> Source:
+        """Where the survey comes from.
+
+        Raises:
+            UsageError: neither the recipe nor the command line names a survey.
+        """
+        if self.survey is None:
+            raise UsageError(f"{self.file}: names no survey; name one with --input")
+        return Source(self.survey, self.folder, readers(self.registry))
+
+    def survey_for(self, path: Path) -> SurveySection:
+        """The survey section with its files replaced by one other file."""
+        if self.survey is None:
+            return SurveySection(file=str(Path(path).resolve()))
+        return self.survey.model_copy(update={"file": str(Path(path).resolve()), "files": None})
+
+    def resolved(self) -> dict[str, Any]:
+        """The recipe with every default written out; a plan made from it is this plan."""
+        found: dict[str, Any] = {
+            "title": self.title,
+            "description": self.description,
+            "authors": list(self.authors),
+            "references": list(self.references),
+        }
+        if self.survey is not None:
+            found["survey"] = self.survey.model_dump(mode="json", exclude_none=True, by_alias=True)
+        if self.plugins:
+            found["plugins"] = list(self.plugins)
+        found["stages"] = [{s.name: dict(s.described)} for s in self.stages]
+        return found
+
+
+def read_plan(
+    recipe: str | Path,
+    *,
+    overrides: Sequence[str] = (),
+    plugin_folders: Sequence[Path] = (),
+    survey: Path | None = None,
+) -> Plan:
+    """Read a recipe file and plan it.
+
+    Args:
+        recipe: the YAML file.
+        overrides: `PATH=VALUE` texts, e.g. `stages.align.to=S2` (see `override`).
+        plugin_folders: folders of single-file plugins beside those the recipe names.
+        survey: takes the place of the files of the recipe's survey section.
+
+    Raises:
+        UsageError: every mistake, with file and line.
+    """
+    return plan(load_yaml(recipe), overrides=overrides, plugin_folders=plugin_folders, survey=survey)
+
+
+def plan(
+    document: Document,
+    *,
+    overrides: Sequence[str] = (),
+    plugin_folders: Sequence[Path] = (),
+    survey: Path | None = None,
+) -> Plan:
+    """Plan a recipe that has been read; as `read_plan`."""
+    for text in overrides:
+        document = override(document, text)
+    return _Planner(document, plugin_folders, survey).plan()
+
+
+def override(document: Document, text: str) -> Document:
+    """Apply one `PATH=VALUE`.
+
+    The path's parts are joined by dots; a stage is named by its name or its number (from 0).
+
+    Raises:
+        UsageError: no `=`, or the path leads nowhere.
+    """
+    path, equals, value_text = text.partition("=")
+    if not equals or not path.strip():
+        raise UsageError(f"--set {text}: must read PATH=VALUE, for instance stages.align.to=S1")
+    value = copy.deepcopy(document.value)
+    here: Any = value
+    at: list[str | int] = []
+    parts = path.strip().split(".")
+    for i, part in enumerate(parts):
+        last = i == len(parts) - 1
+        if isinstance(here, list):
+            number = _item(here, part)
+            if number is None:
+                names = [n for item in here if (n := _item_name(item))]
+                raise UsageError(
+                    f"--set {text}: there is no {part} in {'.'.join(parts[:i])}{did_you_mean(part, names)}"
+                )
+            at.append(number)
+            if isinstance(here[number], str):
+                here[number] = {here[number]: {}}
+            if not part.lstrip("-").isdigit():
+                at.append(part)
+                if here[number][part] is None:
+                    here[number][part] = {}
+                if last:
+                    here[number][part] = parse_scalar(value_text)
+                here = here[number][part]
+            else:
+                if last:
+                    here[number] = parse_scalar(value_text)
+                here = here[number]
+        elif isinstance(here, dict):
+            at.append(part)
+            if last:
+                here[part] = parse_scalar(value_text)
+            elif here.get(part) is None:
+                here[part] = {}
+            here = here[part]
+        else:
+            raise UsageError(f"--set {text}: {'.'.join(parts[:i])} is a single value and has no {part}")
+    lines = {k: n for k, n in document.lines.items() if k[: len(at)] != tuple(at)}
+    return _Overridden(value, document.file, lines, document.folder, {**_set_of(document), tuple(at): text})
+
+
+@dataclass(frozen=True)
+class _Overridden(Document):
+    """A document some of whose values came from the command line."""
+
+    set_by: dict[Location, str] = field(default_factory=dict)
+
+    def where(self, location: Location) -> str:
+        for n in range(len(location), 0, -1):
+            if location[:n] in self.set_by:
+                return f"--set {self.set_by[location[:n]]}"
+            if location[:n] in self.lines:
+                break
+        return super().where(location)
+
+
+def _set_of(document: Document) -> dict[Location, str]:
+    return document.set_by if isinstance(document, _Overridden) else {}
+
+
+def _item_name(item: Any) -> str | None:
+    if isinstance(item, str):
+        return item
+    return str(next(iter(item))) if isinstance(item, dict) and len(item) == 1 else None
+
+
+def _item(items: list[Any], part: str) -> int | None:
+    if part.isdigit():
+        return int(part) if int(part) < len(items) else None
+    named = [i for i, item in enumerate(items) if _item_name(item) == part]
+    return named[0] if named else None
+
+
+class _Planner:
+    def __init__(self, document: Document, plugin_folders: Sequence[Path], survey: Path | None) -> None:
+        self.document = document
+        self.problems = Problems(document)
+        self.plugin_folders = plugin_folders
+        self.input = survey
+        self.registry = Registry()
+
+    def plan(self) -> Plan:
+        value = self.document.value
+        if not isinstance(value, dict):
+            raise UsageError(f"{self.document.where(())}: a recipe is a mapping with the keys {', '.join(TOP_KEYS)}")
+        for key in value:
+            if key not in TOP_KEYS:
+                near = did_you_mean(str(key), TOP_KEYS) or f"; a recipe has {', '.join(TOP_KEYS)}"
+                self.problems.add((key,), f"unknown key{near}")
+        title = self.text("title", required=True)
+        description = self.text("description")
+        authors, references = self.texts("authors"), self.texts("references")
+        plugins = self.plugins()
+        survey = self.survey_section()
+        stages = self.stages()
+        self.check_flow(stages)
+        self.problems.raise_if_any()
+        return Plan(
+            title, description, authors, references, survey, tuple(stages.values()), self.registry,
+            self.document.folder, self.document.file, plugins,
+        )  # fmt: skip
+
+    def text(self, key: str, *, required: bool = False) -> str:
+        value = self.document.value.get(key)
+        if value is None and not required:
+            return ""
+        if not isinstance(value, str) or not value.strip():
+            self.problems.add((key,) if key in self.document.value else (), f"needs a {key}, a line of text")
+            return ""
+        return value
+
+    def texts(self, key: str) -> tuple[str, ...]:
+        value = self.document.value.get(key) or []
+        if isinstance(value, str):
+            value = [value]
+        if not isinstance(value, list) or not all(isinstance(v, str) for v in value):
+            self.problems.add((key,), "must be a list of texts")
+            return ()
+        return tuple(value)
+
+    def plugins(self) -> tuple[str, ...]:
+        """Load the plugins; the recipe's list names folders, files or installed plugins it cannot do without."""
+        names = self.texts("plugins")
+        folders: list[Path] = [Path(f) for f in self.plugin_folders]
+        required = []
+        for i, name in enumerate(names):
+            path = self.document.folder / name
+            at: Location = ("plugins", i) if isinstance(self.document.value["plugins"], list) else ("plugins",)
+            if path.exists():
+                folders.append(path)
+                required.append((at, path))
+            elif "/" in name or name.endswith(".py"):
+                self.problems.add(at, f"there is no {path}")
+            else:
+                required.append((at, name))
+        self.registry = Registry.load(folders)
+        for message in self.registry.problems:
+            self.problems.add((), f"plugins: {message}")
+        for at, wanted in required:
+            self.require(at, wanted)
+        resolved = [
+            str((self.document.folder / n).resolve()) if (self.document.folder / n).exists() else n for n in names
+        ]
+        return tuple(resolved) + tuple(str(Path(f).resolve()) for f in self.plugin_folders)
+
+    def require(self, at: Location, wanted: Path | str) -> None:
+        if isinstance(wanted, Path):
+            for plugin in self.registry.broken():
+                if plugin.file is not None and plugin.file == wanted:
+                    self.problems.add(at, f"{wanted} could not be loaded: {plugin.error}")
+            return
+        known = {p.name: p for p in self.registry.plugins} | {
+            p.distribution: p for p in self.registry.plugins if p.distribution
+        }
+        if wanted not in known:
+            self.problems.add(at, f"no plugin {wanted!r} is installed{did_you_mean(wanted, known)}")
+        elif known[wanted].error:
+            self.problems.add(at, f"the plugin {wanted} could not be loaded: {known[wanted].error}")
+
+    def survey_section(self) -> SurveySection | None:
+        value = self.document.value.get("survey")
+        if isinstance(value, str):
+            value = {"file": value}
+        if self.input is not None:
+            value = (
+                {k: v for k, v in (value or {}).items() if k not in ("file", "files")}
+                | {"file": str(Path(self.input).resolve())}
+                if isinstance(value, dict) or value is None
+                else value
+            )
+        if value is None:
+            return None
+        section = self.problems.validated(SurveySection, value, ("survey",))
+        if section is not None:
+            for place, message in Source(section, self.document.folder, readers(self.registry)).problems():
+                self.problems.add(("survey", *place.split(".")), message)
+        return section
+
+    def stages(self) -> dict[int, PlannedStage]:
+        items = self.document.value.get("stages")
+        if not isinstance(items, list) or not items:
+            self.problems.add(("stages",), "needs a list of stages, each a name or `name: {options}`")
+            return {}
+        planned: dict[int, PlannedStage] = {}
+        for i, item in enumerate(items):
+            name = _item_name(item)
+            if name is None:
+                self.problems.add(("stages", i), "must be a stage's name, or one `name: {options}`")
+                continue
+            options = item[name] if isinstance(item, dict) else {}
+            at: Location = ("stages", i, name) if isinstance(item, dict) else ("stages", i)
+            if ("stage", "", name) not in self.registry.components:
+                self.problems.add(at, self.registry.unknown("stage", name))
+                continue
+            stage = self.stage(self.registry.find("stage", name), {} if options is None else options, at)
+            if stage is not None:
+                planned[i] = stage
+        return planned
+
+    def stage(self, component: Component, options: Any, at: Location) -> PlannedStage | None:
+        if not isinstance(options, dict):
+            self.problems.add(at, "must be a mapping of options")
+            return None
+        taken: list[Component] = [component]
+        bound: dict[str, Any] = {}
+        described: dict[str, Any] = {}
+        rest = dict(options)
+        if component.metrics_option is not None:
+            found = self.metrics(component.metrics_option, rest.pop(component.metrics_option, None), at)
+            if found is None:
+                return None
+            bound[component.metrics_option], described[component.metrics_option], used = found
+            taken += used
+        if component.method_option is not None:
+            option, default = component.method_option
+            name = rest.pop(option, default)
+            if name is None:
+                names = ", ".join(self.registry.names("method", component.name))
+                self.problems.add(at, f"needs {option!r}: one of {names or 'none that is installed'}")
+                return None
+            if ("method", component.name, str(name)) not in self.registry.components:
+                self.problems.add((*at, option), self.registry.unknown("method", str(name), component.name))
+                return None
+            method = self.registry.find("method", str(name), component.name)
+            own = set(component.options.model_fields)
+            theirs = set(method.options.model_fields)
+            known = sorted(own | theirs | {option})
+            for key in [k for k in rest if k not in known]:
+                near = did_you_mean(str(key), known) or f"; it has {', '.join(known)}"
+                self.problems.add((*at, key), f"{component.name} with method {name} has no option {key!r}{near}")
+                del rest[key]
+            model = self.problems.validated(method.options, {k: v for k, v in rest.items() if k in theirs}, at)
+            rest = {k: v for k, v in rest.items() if k in own}
+            if model is None:
+                return None
+            bound[option] = functools.partial(method.function, **_values(model))
+            bound[option].__name__ = method.name
+            described |= {option: method.name} | model.model_dump(mode="json")
+            taken.append(method)
+        model = self.problems.validated(component.options, rest, at)
+        if model is None:
+            return None
+        described |= model.model_dump(mode="json")
+        return PlannedStage(component, bound | _values(model), described, component.declared(described), tuple(taken))
+
+    def metrics(
+        self, option: str, wanted: Any, at: Location
+    ) -> tuple[dict[str, Callable[..., Any]], dict[str, Any], list[Component]] | None:
+        """A mapping `metric name: {options}`, or a list of names, or nothing for every metric there is."""
+        if wanted is None:
+            wanted = self.registry.names("metric")
+        if isinstance(wanted, list) and all(isinstance(w, str) for w in wanted):
+            wanted = {w: {} for w in wanted}
+        if not isinstance(wanted, dict):
+            self.problems.add((*at, option), "must be a list of metrics, or a mapping `metric: {options}`")
+            return None
+        bound: dict[str, Callable[..., Any]] = {}
+        described: dict[str, Any] = {}
+        used = []
+        for name, options in wanted.items():
+            place = (*at, option, name)
+            if ("metric", "", str(name)) not in self.registry.components:
+                self.problems.add(place, self.registry.unknown("metric", str(name)))
+                continue
+            metric = self.registry.find("metric", name)
+            model = self.problems.validated(metric.options, {} if options is None else options, place)
+            if model is not None:
+                bound[name] = functools.partial(metric.function, **_values(model))
+                described[name] = model.model_dump(mode="json")
+                used.append(metric)
+        return bound, described, used
+
+    def check_flow(self, stages: Mapping[int, PlannedStage]) -> None:
+        """Refuse a recipe in which a stage needs a variable that no earlier stage can give."""
+        if self.problems.found:
+            return  # a stage that could not be planned would make the others look wrong
+        available: list[str] = []
+        for i, stage in stages.items():
+            for need in stage.declares.needs:
+                if not any(fnmatchcase(need, a) or fnmatchcase(a, need) for a in available):
+                    self.problems.add(
+                        ("stages", i), f"{stage.name} needs {need}, which no stage before it gives{self.givers(need)}"
+                    )
+            available += [*stage.declares.gives, *stage.declares.may_give]
+
+    def givers(self, need: str) -> str:
+        found = set()
+        for (kind, _, name), component in self.registry.components.items():
+            if kind == "stage" and not callable(component.declares):
+                patterns = (*component.declares.gives, *component.declares.may_give)
+                if any(fnmatchcase(need, g) or fnmatchcase(g, need) for g in patterns):
+                    found.add(name)
+        return f"; given by {', '.join(sorted(found))}" if found else ""
+
+
+def readers(registry: Registry) -> dict[str, Component]:
+    """The reader components by name."""
+    return {name: registry.find("reader", name) for name in registry.names("reader")}
+
+
+def _values(model: Any) -> dict[str, Any]:
+    return {name: getattr(model, name) for name in type(model).model_fields}

@@ -1,0 +1,140 @@
+"""Mistakes in a recipe: collected, then told all at once with file and line."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from magtensor.errors import UsageError, did_you_mean
+from magtensor.recipe.source import Document, Location
+
+if TYPE_CHECKING:
+    from pydantic import BaseModel
+
+    Model = TypeVar("Model", bound=BaseModel)
+
+
+@dataclass
+class Problems:
+    """Collects mistakes in one document."""
+
+    document: Document
+    found: list[tuple[int, str]] = field(default_factory=list)
+
+    def add(self, at: Location, message: str) -> None:
+        """A mistake at a place in the document."""
+        line = f"{self.document.where(at)}: {dotted(at)}{message}"
+        number = next((self.document.lines[at[:n]] for n in range(len(at), -1, -1) if at[:n] in self.document.lines), 0)
+        if (number, line) not in self.found:
+            self.found.append((number, line))
+
+    def raise_if_any(self) -> None:
+        """Tell them all, in the order of the file.
+
+        Raises:
+            UsageError: with one line a mistake.
+        """
+        if self.found:
+            raise UsageError("\n".join(line for _, line in sorted(self.found, key=lambda pair: pair[0])))
+
+    def validated(self, model: type[Model], value: Any, at: Location) -> Model | None:
+        """The value as this pydantic model; None, with the mistakes collected, where it does not fit."""
+        from pydantic import ValidationError
+
+        if not isinstance(value, dict):
+            self.add(at, f"must be a mapping of options, not {_shown(value)}")
+            return None
+        try:
+            # JSON mode: strict about types, yet a list may become a tuple and a string a path
+            return model.model_validate_json(json.dumps(value))
+        except ValidationError as error:
+            for one in error.errors(include_url=False):
+                self._add_pydantic(one, value, at, model)
+            return None
+
+    def _add_pydantic(self, error: Any, value: Any, at: Location, model: type[BaseModel]) -> None:
+        trail, here = _walk(value, error["loc"])
+        kind, place = error["type"], (*at, *trail)
+        if kind == "extra_forbidden":
+            known = _known_keys(model, error["loc"][:-1])
+            near = did_you_mean(str(trail[-1]), known) or (f"; known here: {', '.join(known)}" if known else "")
+            self.add(
+                place[:-1], f"unknown key {str(trail[-1])!r}{near}"
+            ) if place not in self.document.lines else self.add(place, f"unknown key{near}")
+        elif kind == "missing":
+            self.add(place, f"needs {str(error['loc'][-1])!r}")
+        elif kind == "literal_error":
+            expected = str(error["ctx"]["expected"])
+            names = [w.strip("' ") for w in expected.replace(" or ", ",").split(",")]
+            self.add(place, f"must be {expected}, not {_shown(here)}{did_you_mean(str(here), names)}")
+        else:
+            message = str(error["msg"]).removeprefix("Value error, ")
+            self.add(place, f"{message[:1].lower()}{message[1:]}, not {_shown(here)}" if _scalar(here) else message)
+
+
+def dotted(at: Sequence[str | int]) -> str:
+    """`stages[2].align.to: ` for a location, nothing for the whole document."""
+    text = ""
+    for part in at:
+        text += f"[{part}]" if isinstance(part, int) else f".{part}" if text else str(part)
+    return f"{text}: " if text else ""
+
+
+def _walk(value: Any, location: Sequence[str | int]) -> tuple[tuple[str | int, ...], Any]:
+    """The part of pydantic's location that exists in the value (it also names union branches), and what is there."""
+    trail: list[str | int] = []
+    here = value
+    for part in location:
+        if isinstance(here, dict):
+            key = next((k for k in here if str(k) == str(part)), None)
+            if key is None:
+                continue
+            trail.append(key)
+            here = here[key]
+        elif isinstance(here, list) and isinstance(part, int) and part < len(here):
+            trail.append(part)
+            here = here[part]
+    return tuple(trail), here
+
+
+def _known_keys(model: type[BaseModel], location: Sequence[str | int]) -> list[str]:
+    """The keys of the (nested) model at pydantic's location, as far as its branches can be told."""
+    from typing import get_args
+
+    from pydantic import BaseModel
+
+    current: list[Any] = [model]
+    for part in location:
+        following: list[Any] = []
+        for candidate in current:
+            if isinstance(candidate, type) and issubclass(candidate, BaseModel):
+                if part in candidate.model_fields:
+                    following.append(candidate.model_fields[str(part)].annotation)
+                elif part == candidate.__name__:
+                    following.append(candidate)
+                continue
+            for inner in get_args(candidate):
+                following.append(inner)
+        current = following or current
+    keys: set[str] = set()
+    while current:
+        candidate = current.pop()
+        if isinstance(candidate, type) and issubclass(candidate, BaseModel):
+            keys |= {f.alias or n for n, f in candidate.model_fields.items()}
+        else:
+            current.extend(get_args(candidate))
+    return sorted(keys)
+
+
+def _scalar(value: Any) -> bool:
+    return not isinstance(value, (dict, list))
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, dict):
+        return "a mapping"
+    if isinstance(value, list):
+        return "a list"
+    return "nothing" if value is None else repr(value)

@@ -1,0 +1,202 @@
+"""What the commands do, from Python: run a recipe, run a result again, apply a calibration."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from magtensor import provenance, result
+from magtensor.errors import DataError
+from magtensor.provenance import Provenance
+from magtensor.recipe.plan import Plan, plan, read_plan
+from magtensor.recipe.source import parse_yaml
+from magtensor.runner import run
+from magtensor.survey.model import Survey
+from magtensor.verdict import sentence, survey_block, verdict
+
+HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
+
+
+@dataclass(frozen=True)
+class Finished:
+    """A run that was written.
+
+    Attributes:
+        directory: where its files are.
+        outcome: the content of `verdict.json`.
+        sentence: the verdict in one sentence.
+        made_by: the provenance, content hash included.
+        survey: after the last stage.
+        notes: what a re-run has to say about differences.
+    """
+
+    directory: Path
+    outcome: dict[str, Any]
+    sentence: str
+    made_by: Provenance
+    survey: Survey
+    notes: tuple[str, ...] = ()
+
+
+def empty_survey(planned: Plan) -> Survey:
+    """A survey that only knows its source: where a recipe that loads begins."""
+    import xarray as xr
+
+    return Survey(xr.DataTree(), source=planned.source())
+
+
+def run_recipe(
+    recipe: Path,
+    output: Path,
+    *,
+    survey: Path | None = None,
+    verify: Path | None = None,
+    overrides: Sequence[str] = (),
+    plugin_folders: Sequence[Path] = (),
+    progress: Callable[[str], None] | None = None,
+) -> Finished:
+    """Run a recipe, or a result again from its own provenance, and write the files of the contract.
+
+    Args:
+        recipe: a YAML recipe, or a `result.nc`.
+        output: the folder to write into.
+        survey: takes the place of the recipe's own survey.
+        verify: a second survey in a uniform field with a total field; its error goes into the verdict.
+        overrides: `PATH=VALUE` texts.
+        plugin_folders: folders of single-file plugins.
+        progress: called with each stage's name.
+
+    Raises:
+        UsageError, DataError: with the exit status of the contract.
+    """
+    before: Provenance | None = None
+    if is_hdf5(recipe):
+        before = provenance.read(recipe)
+        if survey is None:
+            provenance.check_inputs(before)
+        planned = again(recipe, before, overrides=overrides, plugin_folders=plugin_folders, survey=survey)
+    else:
+        planned = read_plan(recipe, overrides=overrides, plugin_folders=plugin_folders, survey=survey)
+    source = planned.source()
+    if progress is not None:
+        progress("start")
+    done = run(planned, empty_survey(planned), progress=progress)
+    made_by = provenance.collect(planned, done.records, source.files())
+    outcome = verdict(done.survey, verify=verification(done.survey, verify, planned) if verify else None)
+    made_by = result.write(output, done.survey, made_by, outcome)
+    notes = compare(before, made_by) if before is not None and not overrides and survey is None else ()
+    return Finished(output, outcome, sentence(outcome), made_by, done.survey, notes)
+
+
+def again(
+    path: Path,
+    before: Provenance,
+    *,
+    overrides: Sequence[str] = (),
+    plugin_folders: Sequence[Path] = (),
+    survey: Path | None = None,
+) -> Plan:
+    """The plan of a result, from its provenance."""
+    import json
+
+    folder = Path(before.notes.get("folder", "."))
+    document = parse_yaml(json.dumps(before.recipe), f"{path}:/provenance", folder)
+    return plan(document, overrides=overrides, plugin_folders=plugin_folders, survey=survey)
+
+
+def compare(before: Provenance, now: Provenance) -> tuple[str, ...]:
+    """In words: whether a re-run gave the same bits, and what was different where not."""
+    if before.content_sha256 == now.content_sha256:
+        return ("reproduced bit for bit",)
+    changes = provenance.differences(before, now)
+    return ("NOT the same bits as the result it was run from", *(changes or ["no version differs"]))
+
+
+def is_hdf5(path: Path) -> bool:
+    """Whether a file begins as HDF5 does."""
+    try:
+        with open(path, "rb") as file:
+            return file.read(len(HDF5_MAGIC)) == HDF5_MAGIC
+    except OSError:
+        return False
+
+
+def verification(calibrated: Survey, path: Path, planned: Plan) -> dict[str, Any] | None:
+    """The error block of another survey, with the calibration just made."""
+    return survey_block(apply_to(calibrated, path, planned))
+
+
+def apply_to(calibration: Survey, path: Path, planned: Plan, *, tolerant: bool = False) -> Survey:
+    """Another survey, loaded as the recipe loads and corrected with a calibration; `tolerant` as in `load_as`."""
+    from magtensor.calibrated import corrected, require_sensors, restored
+    from magtensor.tensors import assembled, stored_assembly
+
+    survey = load_as(planned, path, tolerant=tolerant)
+    require_sensors(survey, result.sensors_of(calibration), str(path))
+    fitted = restored(calibration)
+    survey = survey.merged(corrected(fitted, survey))
+    if "calibration/tensor_gain" in calibration:
+        b, noise = survey.values("calibrated/b"), calibration.values("calibration/noise_std")
+        survey = survey.merged(assembled(stored_assembly(calibration), b, noise, fitted))
+    return survey
+
+
+def load_as(planned: Plan, path: Path, *, tolerant: bool = False) -> Survey:
+    """Run only the stages of a recipe that read and prepare a survey (before any calibration) on another file.
+
+    A stage whose variables this survey lacks is left out; `tolerant` also leaves out one that the data refuse, as
+    long as the survey itself was read (a field needs no base station to be corrected).
+    """
+    from dataclasses import replace
+
+    stages = []
+    for stage in planned.stages:
+        if any(p.startswith("calibration/") for p in (*stage.declares.gives, *stage.declares.needs)):
+            break
+        stages.append(stage)
+    section = planned.survey_for(path)
+    preparing = replace(planned, stages=tuple(stages), survey=section)
+    survey = empty_survey(preparing)
+    for stage in stages:
+        if all(any(_fits(p, need) for p in survey.paths()) for need in stage.declares.needs):
+            try:
+                survey = run(replace(preparing, stages=(stage,)), survey).survey
+            except DataError:
+                if not tolerant or "b_raw" not in survey:
+                    raise
+    if "b_raw" not in survey:
+        raise DataError("the recipe loads no survey before it calibrates", where=planned.file)
+    return survey
+
+
+def _fits(path: str, pattern: str) -> bool:
+    from fnmatch import fnmatchcase
+
+    return fnmatchcase(path, pattern)
+
+
+def apply(calibration: Path, survey: Path, output: Path | None = None) -> Path:
+    """Apply a stored calibration to another survey and write its `/calibrated` group.
+
+    Args:
+        calibration: `calibration.nc` or `result.nc`.
+        survey: another survey of the same sensors, in the layout the recipe of the calibration reads.
+        output: default: the survey's name with `.calibrated.nc`, beside it.
+
+    Returns:
+        The file written.
+    """
+    stored = result.open_result(calibration)
+    made_by = provenance.read(calibration)
+    planned = again(calibration, made_by)
+    found = apply_to(stored, survey, planned, tolerant=True)
+    target = output or survey.with_name(f"{survey.stem}.calibrated.nc")
+    inputs = [provenance.file_facts(survey), provenance.file_facts(calibration)]
+    applied = Provenance(
+        made_by.recipe, inputs, provenance.versions(), made_by.plugins, made_by.stages,
+        notes={**made_by.notes, "applied": "the calibration's own recipe made the calibration; the inputs are what it was applied to"},
+    )  # fmt: skip
+    result.write_calibrated(target, found, applied)
+    return target

@@ -1,0 +1,102 @@
+"""Between the mathematics of the tensor and the survey's variables: assembles, stores and re-applies."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+
+from magtensor.calibration.types import Array, ArrayCalibration
+from magtensor.survey.model import AXES, Survey, Variable
+from magtensor.tensor.assembly import Assembly
+from magtensor.tensor.invariants import Invariants, invariants, invariants_std
+from magtensor.tensor.uncertainty import component_covariance, tensor_std
+
+TENSOR = ("time", "row", "column")
+INVARIANT_UNITS = Invariants("nT2/m2", "nT3/m3", "nT/m", "nT/m")  # type: ignore[arg-type]  # names, not arrays
+_CHUNK = 65536  # samples whose (5, 5) covariances are held at a time
+
+
+def assembly_variables(assembly: Assembly, position: Array, noise: Array) -> dict[str, Variable]:
+    """An assembly as variables of the group `calibration`, all that a later survey needs."""
+    facts = {
+        "units": "1/m",
+        "method": assembly.name,
+        "centre_m": np.asarray(assembly.centre, dtype=float),
+        "determined": json.dumps(list(assembly.determined)),
+        "truncation_order": assembly.truncation_order,
+        "notes": json.dumps(list(assembly.notes)),
+        "long_name": "tensor = gain : b",
+    }
+    return {
+        "calibration/row": (("row",), np.array(AXES), {}),
+        "calibration/column": (("column",), np.array(AXES), {}),
+        "calibration/tensor_gain": (("row", "column", "sensor", "axis"), assembly.gain, facts),
+        "calibration/field_gain": (("row", "sensor", "axis"), assembly.field_gain, {"units": "1"}),
+        "calibration/noise_std": (
+            ("sensor", "axis"), noise, {"units": "nT", "long_name": "white noise of the calibrated field, from second differences"},
+        ),
+        "calibration/position": (("sensor", "axis"), position, {"units": "m"}),
+    }  # fmt: skip
+
+
+def stored_assembly(calibration: Survey) -> Assembly:
+    """The assembly that `assembly_variables` stored."""
+    gain = calibration["calibration/tensor_gain"]
+    return Assembly(
+        str(gain.attrs["method"]),
+        np.asarray(gain.values),
+        np.asarray(calibration.values("calibration/field_gain")),
+        np.asarray(gain.attrs["centre_m"]),
+        tuple(json.loads(gain.attrs["determined"])),
+        int(gain.attrs["truncation_order"]),
+        tuple(json.loads(gain.attrs["notes"])),
+    )
+
+
+def assembled(assembly: Assembly, b: Array, noise: Array, calibration: ArrayCalibration) -> dict[str, Variable]:
+    """Tensor, mean field, invariants and their standard deviations at every sample.
+
+    Args:
+        assembly: the linear map.
+        b: (N, S, 3) nT in one common frame.
+        noise: (S, 3) nT white noise of b; NaN where unknown, and the deviations then hold the calibration's part alone.
+        calibration: with its covariance.
+    """
+    tensor = assembly.apply(b)
+    covariance = np.diag(noise.ravel() ** 2) if np.isfinite(noise).all() else None
+    std = tensor_std(assembly, b, noise_covariance=covariance, calibration=calibration)
+    symmetric = assembly.symmetrised()  # invariants are of the symmetric traceless part
+    values = np.stack(invariants(symmetric.apply(b)), axis=1)
+    deviations = np.empty_like(values)
+    for start in range(0, len(b), _CHUNK):
+        part = slice(start, start + _CHUNK)
+        five = component_covariance(symmetric, b[part], noise_covariance=covariance, calibration=calibration)
+        deviations[part] = np.stack(invariants_std(symmetric.apply(b[part]), five), axis=1)
+    return tensor_variables(tensor, std) | invariant_variables(values, deviations) | {
+        "calibrated/mean_field": (("time", "axis"), assembly.field(b), {"units": "nT", "long_name": "field at the array's centre"}),
+        "residual/trace": (("time",), np.trace(tensor, axis1=1, axis2=2), {"units": "nT/m"}),
+        "residual/asymmetry": (("time",), tensor[:, 0, 1] - tensor[:, 1, 0], {"units": "nT/m", "long_name": "Bxy - Byx"}),
+    }  # fmt: skip
+
+
+def tensor_variables(tensor: Array, std: Array) -> dict[str, Variable]:
+    """`calibrated/tensor` and `tensor_std`."""
+    return {
+        "calibrated/row": (("row",), np.array(AXES), {}),
+        "calibrated/column": (("column",), np.array(AXES), {}),
+        "calibrated/tensor": (TENSOR, tensor, {"units": "nT/m", "long_name": "gradient tensor, dB_row/dx_column"}),
+        "calibrated/tensor_std": (TENSOR, std, {"units": "nT/m", "long_name": "noise and calibration"}),
+    }
+
+
+def invariant_variables(values: Array, deviations: Array) -> dict[str, Any]:
+    """`calibrated/invariants` and `invariants_std`."""
+    names = np.array(Invariants._fields)
+    units = json.dumps(dict(zip(Invariants._fields, INVARIANT_UNITS, strict=True)))
+    return {
+        "calibrated/invariant": (("invariant",), names, {"units_of_each": units}),
+        "calibrated/invariants": (("time", "invariant"), values, {"units": "see invariant"}),
+        "calibrated/invariants_std": (("time", "invariant"), deviations, {"units": "see invariant"}),
+    }

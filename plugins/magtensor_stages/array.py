@@ -1,0 +1,96 @@
+"""The stages that work on calibrated sensors: alignment to one frame, and the tensor."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+from magtensor import DataError, MethodChoice, stage
+from magtensor.calibrated import restored
+from magtensor.calibration.types import PARAMETERS_PER_SENSOR, SensorCalibration
+from magtensor.errors import did_you_mean
+from pydantic import Field
+
+from magtensor_stages.sensors import common_frame
+
+if TYPE_CHECKING:
+    from magtensor.survey.model import Survey
+
+
+@stage(
+    needs=("b_raw", "calibrated/b", "calibration/matrix", "calibration/offset", "calibration/covariance"),
+    uses=("total_field", "calibration/fit_rms"),
+    gives=("calibration/*", "calibration/rotation", "calibrated/b", "residual/contrast"),
+    may_give=("residual/total_field", "residual/total_field_before"),
+)
+def align(
+    survey: Survey,
+    *,
+    method: MethodChoice = "procrustes",
+    to: Annotated[
+        str | None, Field(description="the sensor whose frame becomes the common one; the first if left out")
+    ] = None,
+) -> dict[str, Any]:
+    """Rotate the calibrated sensors into the frame of one of them.
+
+    A method is ``f(b (N, S, 3) nT, calibrations, reference, *, options) -> ArrayCalibration``; the rotation of the
+    whole array stays free.
+    """
+    sensors = survey.sensors
+    if to is not None and to not in sensors:
+        raise DataError(
+            f"align: no sensor is called {to}{did_you_mean(to, sensors)}", hint=f"the survey has {', '.join(sensors)}"
+        )
+    single = restored(survey)
+    size = PARAMETERS_PER_SENSOR
+    fit_rms = survey.values("calibration/fit_rms") if "calibration/fit_rms" in survey else np.full(len(sensors), np.nan)
+    calibrations = [
+        SensorCalibration(
+            single.matrix[i],
+            single.offset[i],
+            single.covariance[i * size : (i + 1) * size, i * size : (i + 1) * size],
+            single.frame,
+            float(fit_rms[i]),
+        )
+        for i in range(len(sensors))
+    ]
+    b = survey.values("calibrated/b")
+    good = survey.good & np.isfinite(b).all(axis=(1, 2))
+    if "total_field" in survey:
+        good &= np.isfinite(survey.values("total_field"))
+    reference = sensors.index(to) if to is not None else 0
+    aligned = method(b[good], calibrations, reference)
+    frame = aligned.frame.replace(f"sensor {reference + 1}", f"sensor {sensors[reference]}")
+    named = type(aligned)(
+        aligned.matrix, aligned.offset, aligned.covariance, frame, aligned.unobservable, aligned.diagnostics
+    )
+    return common_frame(survey, named, method.__name__)
+
+
+@stage(
+    needs=("calibrated/b", "position", "calibration/rotation", "calibration/matrix", "calibration/offset", "calibration/covariance"),
+    uses=("total_field",),
+    gives=(
+        "calibrated/tensor", "calibrated/tensor_std", "calibrated/mean_field", "calibrated/invariants",
+        "calibrated/invariants_std", "calibration/tensor_gain", "calibration/field_gain", "calibration/noise_std",
+        "calibration/position", "residual/trace", "residual/asymmetry",
+    ),
+    may_give=("calibrated/row", "calibrated/column", "calibrated/invariant", "calibration/row", "calibration/column"),
+)  # fmt: skip
+def assemble_tensor(survey: Survey, *, method: MethodChoice = "least_squares") -> dict[str, Any]:
+    """Assemble the gradient tensor, its standard deviation and its invariants from the calibrated sensors.
+
+    A method is ``f(position (S, 3) m, noise_covariance (3 S, 3 S) nT^2 or None, *, options) -> Assembly``. The
+    standard deviation holds the sensors' noise and the uncertainty of the calibration.
+    """
+    from magtensor.calibration.noise import noise_std
+    from magtensor.tensors import assembled, assembly_variables
+
+    b = survey.values("calibrated/b")
+    position = np.asarray(survey.values("position"), dtype=float)
+    good = survey.good & np.isfinite(b).all(axis=(1, 2))
+    total_field = survey.values("total_field") if "total_field" in survey else None
+    noise = noise_std(b[good], None if total_field is None else total_field[good])
+    known = bool(np.isfinite(noise).all() and (noise > 0).all())
+    assembly = method(position, np.diag(noise.ravel() ** 2) if known else None)
+    return assembly_variables(assembly, position, noise) | assembled(assembly, b, noise, restored(survey))
