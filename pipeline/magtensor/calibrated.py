@@ -37,10 +37,10 @@ def stored(calibration: ArrayCalibration, sensors: list[str], **facts: Any) -> d
         "calibration/raw_axis": (("raw_axis",), np.array(AXES), {"long_name": "axis of the raw output"}),
         "calibration/parameter": (("parameter",), np.array(names), {}),
         "calibration/matrix": (("sensor", "axis", "raw_axis"), calibration.matrix, attributes),
-        "calibration/offset": (("sensor", "raw_axis"), calibration.offset, {"units": "nT", "long_name": "offset in raw output"}),
+        "calibration/offset": (("sensor", "raw_axis"), calibration.offset, {"units": "nT"}),
         "calibration/covariance": (
             ("parameter", "parameter_"), calibration.covariance,
-            {"units": "products of the parameters' units (1, nT)", "long_name": "covariance of the parameters"},
+            {"units": "products of the parameters' units (1, nT)"},
         ),
     }  # fmt: skip
 
@@ -59,7 +59,7 @@ def restored(survey: Survey) -> ArrayCalibration:
 
 
 def corrected(calibration: ArrayCalibration, survey: Survey) -> dict[str, Variable]:
-    """`calibrated/b` and, where the total field is known, `residual/total_field` and what it was before, for every sample."""
+    """`calibrated/b` of every sample and, where the total field is known, `residual/total_field`, after and before."""
     raw = np.asarray(survey.values("b_raw"), dtype=float)
     b = calibration.apply(raw)
     given: dict[str, Variable] = {

@@ -78,7 +78,7 @@ def _only(tree: xr.DataTree, *names: str) -> xr.DataTree:
     import xarray as xr
 
     part = xr.DataTree.from_dict({f"/{n}": tree[n].to_dataset() for n in names if n in tree.children})
-    part.attrs = dict(tree.attrs)
+    part.attrs = tree.attrs.copy()
     return part
 
 

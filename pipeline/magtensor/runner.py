@@ -142,8 +142,8 @@ def _merge(stage: PlannedStage, survey: Survey, given: Any) -> tuple[Survey, lis
         return given, [p for p in given.paths() if p not in survey.paths()]
     if not isinstance(given, Mapping):
         raise UsageError(f"stage {stage.name} returned {type(given).__name__}, not a mapping of paths to variables")
-    variables: dict[str, Variable] = dict(given)
-    flags: list[Flag] = list(variables.pop("flags", []))  # type: ignore[call-overload]
+    variables: dict[str, Variable] = {k: v for k, v in given.items() if k != "flags"}
+    flags: list[Flag] = list(given.get("flags", []))
     promised = (*stage.declares.gives, *stage.declares.may_give)
     for path in variables:
         if not any(fnmatchcase(path, pattern) for pattern in promised):

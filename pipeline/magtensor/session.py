@@ -139,7 +139,8 @@ def apply_to(calibration: Survey, path: Path, planned: Plan, *, tolerant: bool =
     survey = survey.merged(corrected(fitted, survey))
     if "calibration/tensor_gain" in calibration:
         b, noise = survey.values("calibrated/b"), calibration.values("calibration/noise_std")
-        survey = survey.merged(assembled(stored_assembly(calibration), b, noise, fitted))
+        position = calibration.values("calibration/position")
+        survey = survey.merged(assembled(stored_assembly(calibration), b, position, noise, fitted))
     return survey
 
 
@@ -196,7 +197,7 @@ def apply(calibration: Path, survey: Path, output: Path | None = None) -> Path:
     inputs = [provenance.file_facts(survey), provenance.file_facts(calibration)]
     applied = Provenance(
         made_by.recipe, inputs, provenance.versions(), made_by.plugins, made_by.stages,
-        notes={**made_by.notes, "applied": "the calibration's own recipe made the calibration; the inputs are what it was applied to"},
+        notes={**made_by.notes, "applied": "recipe and stages are the calibration's, the inputs are this file's"},
     )  # fmt: skip
     result.write_calibrated(target, found, applied)
     return target

@@ -9,7 +9,8 @@ import numpy as np
 
 from magtensor.calibration.types import Array, ArrayCalibration
 from magtensor.survey.model import AXES, Survey, Variable
-from magtensor.tensor.assembly import Assembly
+from magtensor.tensor.assembly import Assembly, unconstrained_assembly
+from magtensor.tensor.elements import closure
 from magtensor.tensor.invariants import Invariants, invariants, invariants_std
 from magtensor.tensor.uncertainty import component_covariance, tensor_std
 
@@ -35,7 +36,7 @@ def assembly_variables(assembly: Assembly, position: Array, noise: Array) -> dic
         "calibration/tensor_gain": (("row", "column", "sensor", "axis"), assembly.gain, facts),
         "calibration/field_gain": (("row", "sensor", "axis"), assembly.field_gain, {"units": "1"}),
         "calibration/noise_std": (
-            ("sensor", "axis"), noise, {"units": "nT", "long_name": "white noise of the calibrated field, from second differences"},
+            ("sensor", "axis"), noise, {"units": "nT", "long_name": "white noise of b, from second differences"},
         ),
         "calibration/position": (("sensor", "axis"), position, {"units": "m"}),
     }  # fmt: skip
@@ -55,30 +56,47 @@ def stored_assembly(calibration: Survey) -> Assembly:
     )
 
 
-def assembled(assembly: Assembly, b: Array, noise: Array, calibration: ArrayCalibration) -> dict[str, Variable]:
+def assembled(
+    assembly: Assembly, b: Array, position: Array, noise: Array, calibration: ArrayCalibration
+) -> dict[str, Variable]:
     """Tensor, mean field, invariants and their standard deviations at every sample.
 
     Args:
         assembly: the linear map.
         b: (N, S, 3) nT in one common frame.
+        position: (S, 3) m.
         noise: (S, 3) nT white noise of b; NaN where unknown, and the deviations then hold the calibration's part alone.
         calibration: with its covariance.
     """
-    tensor = assembly.apply(b)
+    symmetric = assembly.symmetrised()
+    tensor = symmetric.apply(b)
     covariance = np.diag(noise.ravel() ** 2) if np.isfinite(noise).all() else None
-    std = tensor_std(assembly, b, noise_covariance=covariance, calibration=calibration)
-    symmetric = assembly.symmetrised()  # invariants are of the symmetric traceless part
-    values = np.stack(invariants(symmetric.apply(b)), axis=1)
+    std = tensor_std(symmetric, b, noise_covariance=covariance, calibration=calibration)
+    values = np.stack(invariants(tensor), axis=1)
     deviations = np.empty_like(values)
     for start in range(0, len(b), _CHUNK):
         part = slice(start, start + _CHUNK)
         five = component_covariance(symmetric, b[part], noise_covariance=covariance, calibration=calibration)
-        deviations[part] = np.stack(invariants_std(symmetric.apply(b[part]), five), axis=1)
-    return tensor_variables(tensor, std) | invariant_variables(values, deviations) | {
-        "calibrated/mean_field": (("time", "axis"), assembly.field(b), {"units": "nT", "long_name": "field at the array's centre"}),
-        "residual/trace": (("time",), np.trace(tensor, axis1=1, axis2=2), {"units": "nT/m"}),
-        "residual/asymmetry": (("time",), tensor[:, 0, 1] - tensor[:, 1, 0], {"units": "nT/m", "long_name": "Bxy - Byx"}),
-    }  # fmt: skip
+        deviations[part] = np.stack(invariants_std(tensor[part], five), axis=1)
+    mean_field = assembly.field(b)
+    return (
+        tensor_variables(tensor, std)
+        | invariant_variables(values, deviations)
+        | closure_variables(b, position)
+        | {"calibrated/mean_field": (("time", "axis"), mean_field, {"units": "nT", "long_name": "at the centre"})}
+    )
+
+
+def closure_variables(b: Array, position: Array) -> dict[str, Variable]:
+    """`residual/closure`: trace and asymmetries of the separately measured derivatives, nT/m, as far as measured."""
+    measured = unconstrained_assembly(position).apply(b)
+    found = {name: values for name, values in closure(measured).items() if np.isfinite(values).any()}
+    if not found:
+        return {}
+    return {
+        "residual/identity": (("identity",), np.array(list(found)), {"long_name": "zero by Maxwell's equations"}),
+        "residual/closure": (("time", "identity"), np.stack(list(found.values()), axis=1), {"units": "nT/m"}),
+    }
 
 
 def tensor_variables(tensor: Array, std: Array) -> dict[str, Variable]:

@@ -68,14 +68,20 @@ def align(
 
 
 @stage(
-    needs=("calibrated/b", "position", "calibration/rotation", "calibration/matrix", "calibration/offset", "calibration/covariance"),
+    needs=(
+        "calibrated/b", "position", "calibration/rotation", "calibration/matrix", "calibration/offset",
+        "calibration/covariance",
+    ),
     uses=("total_field",),
     gives=(
         "calibrated/tensor", "calibrated/tensor_std", "calibrated/mean_field", "calibrated/invariants",
         "calibrated/invariants_std", "calibration/tensor_gain", "calibration/field_gain", "calibration/noise_std",
-        "calibration/position", "residual/trace", "residual/asymmetry",
+        "calibration/position",
     ),
-    may_give=("calibrated/row", "calibrated/column", "calibrated/invariant", "calibration/row", "calibration/column"),
+    may_give=(
+        "residual/closure", "residual/identity", "calibrated/row", "calibrated/column", "calibrated/invariant",
+        "calibration/row", "calibration/column",
+    ),
 )  # fmt: skip
 def assemble_tensor(survey: Survey, *, method: MethodChoice = "least_squares") -> dict[str, Any]:
     """Assemble the gradient tensor, its standard deviation and its invariants from the calibrated sensors.
@@ -93,4 +99,4 @@ def assemble_tensor(survey: Survey, *, method: MethodChoice = "least_squares") -
     noise = noise_std(b[good], None if total_field is None else total_field[good])
     known = bool(np.isfinite(noise).all() and (noise > 0).all())
     assembly = method(position, np.diag(noise.ravel() ** 2) if known else None)
-    return assembly_variables(assembly, position, noise) | assembled(assembly, b, noise, restored(survey))
+    return assembly_variables(assembly, position, noise) | assembled(assembly, b, position, noise, restored(survey))

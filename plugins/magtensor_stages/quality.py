@@ -25,7 +25,7 @@ def qc(survey: Survey, *, metrics: MetricsChoice = None) -> dict[str, Any]:
 
     verdicts: list[Verdict] = []
     for metric in (metrics or {}).values():
-        component = component_of(metric.func)  # type: ignore[attr-defined]
+        component = component_of(metric.func)
         assert component is not None
         needs = component.declared({}).needs
         if all(survey.matching(need) for need in needs):

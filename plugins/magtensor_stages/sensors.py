@@ -100,4 +100,4 @@ def common_frame(survey: Survey, calibration: ArrayCalibration, method: str) -> 
     rotation = np.stack([rotation_and_upper(m)[0] for m in calibration.matrix])
     attributes = {"units": "1", "frame": calibration.frame, "long_name": "sensor (z along its z axis) to common frame"}
     given["calibration/rotation"] = (("sensor", "axis", "sensor_axis"), rotation, attributes)
-    return given | contrasts(given["calibrated/b"][1])
+    return given | contrasts(calibration.apply(np.asarray(survey.values("b_raw"), dtype=float)))

@@ -268,7 +268,7 @@ class _Planner:
         """Load the plugins; the recipe's list names folders, files or installed plugins it cannot do without."""
         names = self.texts("plugins")
         folders: list[Path] = [Path(f) for f in self.plugin_folders]
-        required = []
+        required: list[tuple[Location, Path | str]] = []
         for i, name in enumerate(names):
             path = self.document.folder / name
             at: Location = ("plugins", i) if isinstance(self.document.value["plugins"], list) else ("plugins",)

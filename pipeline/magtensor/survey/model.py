@@ -137,7 +137,7 @@ class Survey:
     @property
     def good(self) -> NDArray[np.bool_]:
         """(N,) True where every sensor's sample may be used; all True before anything was flagged."""
-        return self.good_by_sensor.all(axis=1)
+        return np.asarray(self.good_by_sensor.all(axis=1))
 
     @property
     def good_by_sensor(self) -> NDArray[np.bool_]:
