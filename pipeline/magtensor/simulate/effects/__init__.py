@@ -1,0 +1,77 @@
+"""The effects that a scenario can put into a survey, by their names in the catalogue of error models."""
+
+from typing import Annotated
+
+from pydantic import Field
+
+from magtensor.simulate.effects.electronics import (
+    OffsetDrift,
+    OffsetStep,
+    ScaleDrift,
+    SupplyOffset,
+    SupplyScale,
+    TemperatureOffset,
+    TemperatureRate,
+    TemperatureScale,
+    WarmUp,
+)
+from magtensor.simulate.effects.geometry import BaselineExpansion, PositionError
+from magtensor.simulate.effects.platform import (
+    ChannelResponse,
+    Crosstalk,
+    CurrentField,
+    EddyCurrent,
+    FrameFlexure,
+    LatentSource,
+    MovingPart,
+    PeriodicInterference,
+    ViscousMagnetisation,
+)
+from magtensor.simulate.effects.reference import ReferenceClock, ReferenceScale, ReferenceStep
+from magtensor.simulate.effects.sensor import (
+    Bandwidth,
+    CrossField,
+    Hysteresis,
+    NonlinearityCubic,
+    NonlinearityQuadratic,
+)
+from magtensor.simulate.effects.site import FixedSource, PassingSource, SiteGradient
+from magtensor.simulate.effects.timing import ClockDrift, Jitter, SamplingLag
+
+AnyEffect = Annotated[
+    TemperatureOffset
+    | TemperatureScale
+    | TemperatureRate
+    | OffsetDrift
+    | ScaleDrift
+    | WarmUp
+    | OffsetStep
+    | SupplyScale
+    | SupplyOffset
+    | CurrentField
+    | ChannelResponse
+    | LatentSource
+    | MovingPart
+    | PeriodicInterference
+    | Crosstalk
+    | EddyCurrent
+    | ViscousMagnetisation
+    | FrameFlexure
+    | NonlinearityQuadratic
+    | NonlinearityCubic
+    | CrossField
+    | Hysteresis
+    | Bandwidth
+    | SamplingLag
+    | ClockDrift
+    | Jitter
+    | PositionError
+    | BaselineExpansion
+    | FixedSource
+    | SiteGradient
+    | PassingSource
+    | ReferenceScale
+    | ReferenceClock
+    | ReferenceStep,
+    Field(discriminator="type"),
+]
