@@ -61,6 +61,7 @@ UNITS: dict[str, Unit] = {
     "uV": Unit(_VOLTAGE, 1e-6),
     "rad": Unit(_ANGLE, 1.0),
     "deg": Unit(_ANGLE, _DEGREE),
+    "arcmin": Unit(_ANGLE, _DEGREE / 60.0),
     "rad s-1": Unit(_RATE, 1.0),
     "deg s-1": Unit(_RATE, _DEGREE),
     "m s-2": Unit(_ACCELERATION, 1.0),

@@ -3,21 +3,276 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
 
 from magtensor.components import stage
-from magtensor.errors import UsageError
-from magtensor.survey.model import Survey
+from magtensor.errors import DataError, NotEnoughData, UsageError, did_you_mean
+from magtensor.survey import checks
+from magtensor.survey.flags import Flag, flag_ranges
+from magtensor.survey.model import AXES, Survey
+
+BY = "load"
 
 
 @stage(
-    gives=("time", "sensor", "axis", "b_raw"),
+    gives=("time", "sensor", "axis", "b_raw", "good"),
     may_give=(
-        "position", "reference/*", "temperature", "current_*", "acceleration", "angular_rate", "attitude", "segment",
-        "good",
+        "position", "reference/time", "reference/total_field", "reference/world_field", "temperature", "current_*",
+        "acceleration", "angular_rate", "attitude", "segment",
     ),
 )  # fmt: skip
-def load(survey: Survey) -> Survey:
-    """Read the survey."""
+def load(
+    survey: Survey,
+    *,
+    sensors: Annotated[
+        tuple[str, ...] | None, Field(description="use only these sensors; default: all")
+    ] = None,
+    window_s: Annotated[
+        tuple[float, float] | None, Field(description="use only this span, s after the first sample")
+    ] = None,
+    time_faults: Annotated[
+        Literal["refuse", "drop"],
+        Field(description="samples whose time repeats, steps back or is missing: refuse the survey, or drop them"),
+    ] = "refuse",
+    magnitude: Annotated[
+        Literal["refuse", "accept"],
+        Field(description="a field that cannot be the Earth's (wrong units, missing base values)"),
+    ] = "refuse",
+    copied_axes: Annotated[
+        Literal["refuse", "accept"], Field(description="two axes that hold the same numbers")
+    ] = "refuse",
+    saturation_nT: Annotated[
+        float | None, Field(gt=0, description="end of the sensors' range, nT; default: found from the data")
+    ] = None,
+    max_flagged_share: Annotated[
+        float, Field(gt=0, lt=1, description="refuse a sensor of which a larger share of samples is flagged")
+    ] = 0.5,
+) -> Survey:
+    """Read the survey, check it, and flag the samples that cannot be used.
+
+    Refused: times that do not increase, an axis without signal, a sensor that is stuck, two axes with the same
+    numbers, magnitudes that betray wrong units, more flagged samples than allowed. Flagged: missing and infinite
+    values, saturation, runs in which a sensor repeats itself. Reported with the variables: sampling, quantisation.
+    """
     if survey.source is None:
-        raise UsageError("load: the recipe has no `survey` section and the command line names no survey")
-    return replace(survey.source.read(), source=survey.source)
+        raise UsageError("load: the recipe has no `survey` section, and no survey was named on the command line")
+    found = survey.source.read()
+    where = str(found.attributes.get("source", ""))
+    notes = list(found.attributes.get("notes", ()))
+    found = _increasing(found, time_faults, where, notes)
+    found = _reference_times(found, time_faults, where, notes)
+    if sensors is not None:
+        found = _only_sensors(found, sensors, where)
+    if window_s is not None:
+        found = _only_window(found, window_s, where)
+    if len(found.time) < 2:
+        raise NotEnoughData("a single sample is no survey", where=where)
+    _refuse_faults(found, magnitude, copied_axes, where)
+    good, flags = _flagged(found, saturation_nT, where)
+    share = 1.0 - good.mean(axis=0)
+    for name, bad in zip(found.sensors, share, strict=True):
+        if bad > max_flagged_share:
+            reasons = sorted({f.reason for f in (*found.flags, *flags) if f.sensor == name})
+            raise DataError(
+                f"{100 * bad:.0f} % of its samples cannot be used: {'; '.join(reasons)}",
+                where=f"{where}: sensor {name}",
+                hint=f"load allows max_flagged_share {max_flagged_share:g}; `sensors` can leave the sensor out",
+            )
+    attributes = {**found.attributes, **({"notes": notes} if notes else {})}
+    loaded = replace(found, attributes=attributes, source=survey.source)
+    return loaded.merged({**_described(loaded), "good": (("time", "sensor"), good, {"long_name": "may be used"})}, flags)
+
+
+def _clock(seconds: float) -> str:
+    return f"t = {seconds:.3f} s"
+
+
+def _increasing(survey: Survey, time_faults: str, where: str, notes: list[str]) -> Survey:
+    time = survey.time
+    onward = checks.moves_on(time)
+    if onward.all():
+        return survey
+    first = int(np.flatnonzero(~onward)[0])
+    if not onward.any():
+        raise DataError("no time is a number", where=f"{where}: time")
+    before = float(time[:first][np.isfinite(time[:first])][-1]) if first else np.nan
+    now = float(time[first])
+    if not np.isfinite(now):
+        what = f"the time of sample {first} is missing"
+    elif now == before:
+        what = f"sample {first} has the same time as the one before, {_clock(now)}"
+    else:
+        what = f"the clock steps back at sample {first}, from {_clock(before)} to {_clock(now)}"
+    count = int((~onward).sum())
+    if time_faults == "refuse":
+        raise DataError(
+            f"{what}; {count} sample{'s' * (count > 1)} of {len(time)} do not move on",
+            where=f"{where}: time",
+            hint="`load: {time_faults: drop}` leaves them out",
+        )
+    notes.append(f"{count} samples left out whose time does not move on; {what}")
+    return _rows(survey, onward)
+
+
+def _reference_times(survey: Survey, time_faults: str, where: str, notes: list[str]) -> Survey:
+    """Reference samples without a value go; those whose time does not move on are refused or go."""
+    if "reference/total_field" not in survey:
+        return survey
+    time = np.asarray(survey.values("reference/time"), dtype=np.float64)
+    known = np.isfinite(survey.values("reference/total_field"))
+    if not known.any():
+        raise DataError("every value is missing", where=f"{where}: reference/total_field")
+    onward = checks.moves_on(time[known])
+    if not onward.all():
+        at = int(np.flatnonzero(known)[np.flatnonzero(~onward)[0]])
+        what = f"the time of the reference's sample {at}, {_clock(float(time[at]))}, does not move on"
+        if time_faults == "refuse":
+            raise DataError(
+                what, where=f"{where}: reference/time", hint="`load: {time_faults: drop}` leaves such samples out"
+            )
+        notes.append(f"{int((~onward).sum())} reference samples left out; {what}")
+    keep = np.flatnonzero(known)[onward]
+    if len(keep) == len(time):
+        return survey
+    if not known.all():
+        notes.append(f"{int((~known).sum())} of {len(time)} reference samples have no value and are left out")
+    return _select(survey, "reference", {"time": keep})
+
+
+def _select(survey: Survey, node: str, indexers: dict[str, Any]) -> Survey:
+    import xarray as xr
+
+    nodes = {name: child.to_dataset() for name, child in survey.tree.children.items()}
+    nodes[node] = nodes[node].isel(indexers)
+    return replace(survey, tree=xr.DataTree.from_dict({f"/{n}": d for n, d in nodes.items()}))
+
+
+def _rows(survey: Survey, keep: NDArray[np.bool_]) -> Survey:
+    return _select(survey, "array", {"time": np.flatnonzero(keep)})
+
+
+def _only_sensors(survey: Survey, wanted: tuple[str, ...], where: str) -> Survey:
+    for name in wanted:
+        if name not in survey.sensors:
+            raise DataError(
+                f"there is no sensor {name}{did_you_mean(name, survey.sensors)}",
+                where=where,
+                hint=f"the survey has {', '.join(survey.sensors)}",
+            )
+    cut = _select(survey, "array", {"sensor": [survey.sensors.index(n) for n in wanted]})
+    return replace(cut, flags=tuple(f for f in cut.flags if f.sensor in ("", *wanted)))
+
+
+def _only_window(survey: Survey, window_s: tuple[float, float], where: str) -> Survey:
+    since_start = survey.time - survey.time[0]
+    keep = (since_start >= window_s[0]) & (since_start <= window_s[1])
+    if keep.sum() < 2:
+        raise NotEnoughData(
+            f"fewer than two samples between {window_s[0]:g} and {window_s[1]:g} s after the first",
+            where=f"{where}: time",
+            hint=f"the survey lasts {since_start[-1]:g} s",
+        )
+    cut = _rows(survey, keep)
+    first, last = cut.time[0], cut.time[-1]
+    return replace(cut, flags=tuple(f for f in cut.flags if f.stop >= first and f.start <= last))
+
+
+def _refuse_faults(survey: Survey, magnitude: str, copied_axes: str, where: str) -> None:
+    field = survey.values("b_raw")
+    names = survey.sensors
+    for s, name in enumerate(names):
+        here = f"{where}: sensor {name}"
+        for a, axis in enumerate(AXES):
+            if not np.isfinite(field[:, s, a]).any():
+                raise DataError(f"axis {axis} holds no number at all", where=here)
+        spread = np.nanmax(np.where(np.isfinite(field[:, s]), field[:, s], -np.inf), axis=0) - np.nanmin(
+            np.where(np.isfinite(field[:, s]), field[:, s], np.inf), axis=0
+        )
+        if (spread == 0).all():
+            raise DataError(
+                "the sensor is stuck: all its samples are the same", where=here,
+                hint="`load: {sensors: [...]}` can leave the sensor out",
+            )  # fmt: skip
+        for a in checks.dead_axes(field[:, s]):
+            raise DataError(
+                f"axis {AXES[a]} is dead: it is {field[:, s, a][np.isfinite(field[:, s, a])][0]:g} nT in every sample",
+                where=here,
+                hint="`load: {sensors: [...]}` can leave the sensor out",
+            )
+    for s, a in checks.deaf_axes(field):
+        raise DataError(
+            f"axis {AXES[a]} is dead: it varies a hundred times less than any direction of the other sensors",
+            where=f"{where}: sensor {names[s]}",
+            hint="`load: {sensors: [...]}` can leave the sensor out",
+        )
+    if copied_axes == "refuse":
+        for s, a, other, b in checks.copies(field):
+            raise DataError(
+                f"{names[s]} {AXES[a]} and {names[other]} {AXES[b]} hold the same numbers in every sample",
+                where=f"{where}: b_raw",
+                hint="is one column mapped twice? `load: {copied_axes: accept}` lets it pass",
+            )
+    if magnitude == "refuse":
+        _refuse_magnitude(survey, where)
+
+
+def _refuse_magnitude(survey: Survey, where: str) -> None:
+    accept = "`load: {magnitude: accept}` lets it pass"
+    medians = np.nanmedian(np.linalg.norm(survey.values("b_raw"), axis=2), axis=0)
+    for name, median in zip(survey.sensors, medians, strict=True):
+        suspicion = checks.unit_suspicion(float(median))
+        if suspicion:
+            hint = f"are its units right, and base values or offsets added? {accept}"
+            raise DataError(suspicion, where=f"{where}: sensor {name}", hint=hint)
+    if "reference/total_field" in survey:
+        reference = float(np.nanmedian(survey.values("reference/total_field")))
+        suspicion = checks.unit_suspicion(reference)
+        if suspicion:
+            raise DataError(suspicion, where=f"{where}: reference/total_field", hint=f"are its units right? {accept}")
+
+
+def _flagged(
+    survey: Survey, saturation_nT: float | None, where: str
+) -> tuple[NDArray[np.bool_], list[Flag]]:
+    """(N, S) usable samples, and the flags that say why the others are not."""
+    field, time = survey.values("b_raw"), survey.time
+    good = survey.good_by_sensor.copy()
+    flags: list[Flag] = []
+    for s, name in enumerate(survey.sensors):
+        own = field[:, s]
+        missing, infinite = np.isnan(own).any(axis=1), np.isinf(own).any(axis=1)
+        rails = (np.abs(own) >= saturation_nT) if saturation_nT is not None else checks.saturated(own)
+        others = np.delete(field, s, axis=1) if field.shape[1] > 1 else None
+        for bad, reason in (
+            (missing, "missing value"),
+            (infinite, "infinite value"),
+            (rails.any(axis=1), f"saturated on axis {', '.join(AXES[a] for a in np.flatnonzero(rails.any(axis=0)))}"),
+            (checks.stuck(own, others), "stuck: the same numbers for longer than chance explains"),
+        ):
+            flags += flag_ranges(time, bad, by=BY, reason=reason, sensor=name)
+            good[:, s] &= ~bad
+    return good, flags
+
+
+def _described(survey: Survey) -> dict[str, Any]:
+    """`time` and `b_raw` with what was found of them: rate, gaps, quantisation, share of new samples."""
+    time, field = survey["time"], survey["b_raw"]
+    found = checks.sampling(survey.time)
+    facts = {
+        "rate_Hz": found.rate_Hz,
+        "jitter_s": found.jitter_s,
+        "gaps": found.gaps,
+        "longest_gap_s": found.longest_gap_s,
+        "missing_samples": found.missing,
+    }
+    raw = field.values
+    steps = [max(checks.resolution(raw[:, s, a]) for a in range(3)) for s in range(raw.shape[1])]
+    fresh = [checks.new_share(raw[:, s]) for s in range(raw.shape[1])]
+    return {
+        "time": (("time",), time.values, {**time.attrs, **facts}),
+        "b_raw": (field.dims, raw, {**field.attrs, "quantisation_nT": steps, "new_sample_share": fresh}),
+    }

@@ -37,6 +37,19 @@ class Column:
     attributes: Mapping[str, Any] = field(default_factory=dict)
     text: bool = False
 
+    @classmethod
+    def of(
+        cls,
+        name: str,
+        origin: str,
+        values: NDArray[Any],
+        units: str | None = None,
+        attributes: Mapping[str, Any] | None = None,
+    ) -> Column:
+        """A column whose values have been read already."""
+        text = values.dtype.kind in "OSU"
+        return cls(name, origin, values.shape, lambda: values, units, None, attributes or {}, text)
+
 
 @dataclass(frozen=True)
 class Tables:

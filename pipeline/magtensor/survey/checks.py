@@ -1,0 +1,282 @@
+"""What can be wrong with a survey's data: one small function for each fault.
+
+The functions find; the stage `load` decides what to refuse and what to flag.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+# The Earth's total field at its surface lies between 22 and 67 uT; offsets and nearby iron widen what a raw
+# sensor shows, at 31 km height it is 1.5 % less. Half and twice are far from every factor between two units.
+EARTH_FIELD_NT = (22_000.0, 67_000.0)
+MARGIN = 2.0
+RIVAL_UNITS = {
+    "uT": 1e3, "mT": 1e6, "T": 1e9, "mG": 1e2, "G": 1e5, "pT": 1e-3, "nT already multiplied by 1000": 1e-3,
+    "nT already multiplied by 1e6": 1e-6,
+}  # fmt: skip
+
+
+def moves_on(time: Floats) -> Bools:
+    """(N,) True where the time is known and later than every one before.
+
+    A sample that steps back or repeats is False, and so is each that follows until the clock has caught up.
+    """
+    known = np.isfinite(time)
+    running = np.maximum.accumulate(np.where(known, time, -np.inf))
+    onward = known.copy()
+    onward[1:] &= time[1:] > running[:-1]
+    return onward
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """How regular the time base is.
+
+    Attributes:
+        step_s: median step, s.
+        jitter_s: half of the range that holds 90 % of the steps that are no gaps, s.
+        gaps: steps longer than 1.5 median steps.
+        longest_gap_s: the longest step, s.
+        missing: samples that would fill the gaps.
+    """
+
+    step_s: float
+    jitter_s: float
+    gaps: int
+    longest_gap_s: float
+    missing: int
+
+    @property
+    def rate_Hz(self) -> float:
+        return 1.0 / self.step_s
+
+
+def sampling(time: Floats) -> Sampling:
+    """The time base's step, jitter and gaps.
+
+    Half a step more than the step is what tells a lost sample from jitter.
+
+    Args:
+        time: (N,) s, strictly increasing, N >= 2.
+    """
+    steps = np.diff(time)
+    step = float(np.median(steps))
+    gap = steps > 1.5 * step
+    low, high = np.percentile(steps[~gap], [5, 95])
+    missing = int(np.round(steps[gap] / step - 1).sum())
+    return Sampling(step, float(high - low) / 2, int(gap.sum()), float(steps.max()), missing)
+
+
+def resolution(values: Floats) -> float:
+    """The quantisation step of a channel, 0 where none shows.
+
+    The smallest difference between recorded values is the step if all other differences are whole multiples of it
+    (to 1 %, as decimal text rounds) and values repeat; noise that was never quantised hardly ever repeats.
+
+    Args:
+        values: (N,) numbers, NaN allowed.
+    """
+    distinct = np.unique(values[np.isfinite(values)])
+    if len(distinct) < 3 or len(distinct) > 0.9 * np.isfinite(values).sum():
+        return 0.0
+    steps = np.diff(distinct)
+    # Numbers that differ by rounding only (0.1 + 0.2 and 0.3) are the same recorded value.
+    steps = steps[steps > 1e-9 * max(abs(distinct[0]), abs(distinct[-1]))]
+    if len(steps) == 0:
+        return 0.0
+    # The smallest step alone may be off by the rounding of two printed numbers; the mean of those near it is not.
+    step = float(steps[steps < 1.5 * steps.min()].mean())
+    multiples = steps / step
+    return step if np.mean(np.abs(multiples - np.round(multiples)) < 0.01 * np.maximum(multiples, 1)) > 0.95 else 0.0
+
+
+def runs(equal: Bools) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Where runs of equal neighbours start, and how many samples each holds.
+
+    Args:
+        equal: (N-1,) True where a sample equals the one before.
+
+    Returns:
+        starts (R,) and lengths (R,), only runs of at least two samples.
+    """
+    edges = np.flatnonzero(np.diff(np.concatenate(([False], equal, [False])).astype(np.int8)))
+    return edges[0::2], edges[1::2] - edges[0::2] + 1
+
+
+def believable_run(count: int, repeats: float) -> float:
+    """The longest run of one number that chance explains.
+
+    If a share q of the samples repeats the one before (slow instruments, coarse steps), the longest run to be
+    expected among N samples is about ln N / -ln q; a chance of 1e-6 is granted, and ten samples in any case.
+
+    Args:
+        count: N.
+        repeats: q.
+    """
+    share = min(max(repeats, 1.0 / count), 1.0 - 1.0 / count)
+    return float(max(10.0, np.log(count * 1e6) / -np.log(share)))
+
+
+def stuck(field: Floats, others: Floats | None = None) -> Bools:
+    """(N,) True where a sensor repeats itself for longer than its own record makes believable.
+
+    Rest makes long runs too, so a run also needs a witness: other sensors, all of which moved meanwhile by more
+    than ten of their noise and of this sensor's steps; or, without others, a jump at the run's end larger than
+    99 % of all steps, or that it never ends.
+
+    Args:
+        field: (N, 3) nT.
+        others: (N, K, 3) nT; None where there is no other sensor.
+    """
+    found = np.zeros(len(field), dtype=bool)
+    if len(field) < 20:
+        return found
+    equal = (field[1:] == field[:-1]).all(axis=1)
+    starts, lengths = runs(equal)
+    if len(starts) == 0:
+        return found
+    # Without its longest run, which is the suspect: one long fault must not make itself look usual.
+    longest = int(lengths.max())
+    believable = believable_run(len(field), (equal.sum() - (longest - 1)) / max(len(field) - longest, 1))
+    steps = np.nan_to_num(np.linalg.norm(np.diff(field, axis=0), axis=1))
+    moving = steps[steps > 0]
+    usual = float(np.percentile(moving, 99)) if moving.size else 0.0
+    enough = 10 * max(max(resolution(field[:, a]) for a in range(3)), 0.0 if others is None else _noise(others))
+    for start, length in zip(starts, lengths, strict=True):
+        if length <= believable:
+            continue
+        stop = start + length
+        if others is not None:
+            found[start:stop] |= _span(others[start:stop]) > enough
+        else:
+            found[start:stop] |= stop == len(field) or steps[stop - 1] > usual
+    return found
+
+
+def _span(field: Floats) -> float:
+    """How far the field vector moved from where it was, nT; of several sensors the one that moved least."""
+    away = np.linalg.norm(field - field[0], axis=-1)
+    if not np.isfinite(away).any():
+        return 0.0
+    return float(np.min(np.nanmax(np.where(np.isfinite(away), away, 0.0), axis=0)))
+
+
+def _noise(field: Floats) -> float:
+    """Noise from second differences, which a smooth motion hardly enters, nT; the noisiest axis."""
+    second = np.abs(field[2:] - 2 * field[1:-1] + field[:-2])
+    return float(np.max(np.nan_to_num(np.nanmedian(second, axis=0)))) * 1.4826 / np.sqrt(6.0)
+
+
+def dead_axes(field: Floats) -> list[int]:
+    """The axes that never change while another of the same sensor does.
+
+    Args:
+        field: (N, 3) nT, NaN allowed.
+    """
+    spread = np.array([np.ptp(c[np.isfinite(c)]) if np.isfinite(c).any() else np.nan for c in field.T])
+    return [a for a in range(3) if spread[a] == 0 and np.nanmax(spread) > 0]
+
+
+def deaf_axes(field: Floats) -> list[tuple[int, int]]:
+    """(sensor, axis) that hears the field a hundred times less than any axis of the other sensors: noise only.
+
+    Turning the platform about one axis leaves one direction without change in every sensor alike; so a sensor's
+    weakest direction is compared with the weakest of the others, whatever their axes are called.
+
+    Args:
+        field: (N, S, 3) nT; samples with NaN are left out.
+    """
+    whole = field[np.isfinite(field).all(axis=(1, 2))]
+    if field.shape[1] < 2 or len(whole) < 10:
+        return []
+    weakest = np.array([np.linalg.svd(f - f.mean(axis=0), compute_uv=False)[-1] for f in whole.transpose(1, 0, 2)])
+    found = []
+    for s in range(field.shape[1]):
+        if weakest[s] < 0.01 * np.delete(weakest, s).min():
+            found.append((s, int(whole[:, s].std(axis=0).argmin())))
+    return found
+
+
+def saturated(field: Floats) -> Bools:
+    """(N, 3) True where an axis sits at the end of its range.
+
+    An amplifier or converter at its rail repeats one extreme number exactly. Runs of three or more at the extreme
+    count if the other axes moved meanwhile by twenty steps (at rest a number repeats without fault), or if the run
+    is longer than chance explains for this axis. They are saturation if together they hold at least five samples,
+    ten times as many as the mean of the values within five steps below the extreme: turning points of a motion
+    pile up too, but not on one number alone.
+
+    Args:
+        field: (N, 3) nT.
+    """
+    found = np.zeros(field.shape, dtype=bool)
+    for axis in range(3):
+        values = field[:, axis]
+        finite = np.isfinite(values)
+        if finite.sum() < 20 or np.ptp(values[finite]) == 0:
+            continue
+        step = resolution(values)
+        others = np.delete(field, axis, axis=1)
+        for rail, side in ((values[finite].max(), 1.0), (values[finite].min(), -1.0)):
+            at = values == rail
+            off = values[~at]
+            believable = believable_run(len(values), float((off[1:] == off[:-1]).mean()) if len(off) > 1 else 0.0)
+            starts, lengths = runs(at[1:] & at[:-1])
+            count = sum(
+                int(n)
+                for a, n in zip(starts, lengths, strict=True)
+                if n >= 3 and (_span(others[a : a + n]) > 20 * step or n > believable)
+            )
+            distance = side * (rail - values)
+            near = int(((distance > 0) & (distance <= 5 * step)).sum())
+            if count >= 5 and count >= 10 * near / 5:
+                found[:, axis] |= at
+    return found
+
+
+def unit_suspicion(median_nT: float) -> str | None:
+    """Why a median total field (nT, as labelled) cannot be the Earth's, and what unit would make it so; else None."""
+    low, high = EARTH_FIELD_NT
+    if low / MARGIN <= median_nT <= high * MARGIN:
+        return None
+    fitting = [unit for unit, factor in RIVAL_UNITS.items() if low <= median_nT * factor <= high]
+    shown = f"the median magnitude is {median_nT:.6g} nT, the Earth's field is {low:g} to {high:g} nT"
+    return f"{shown}; looks like {fitting[0]} labelled nT" if fitting else shown
+
+
+def copies(field: Floats) -> list[tuple[int, int, int, int]]:
+    """Pairs of axes that hold the same numbers: (sensor, axis, sensor, axis).
+
+    Two instruments never agree to the last digit over a survey that varies; one column given twice does.
+
+    Args:
+        field: (N, S, 3) nT.
+    """
+    count, sensors, _ = field.shape
+    flat = field.reshape(count, -1)
+    probe = np.unique(np.linspace(0, count - 1, min(count, 1000)).astype(int))
+    found = []
+    for i in range(flat.shape[1]):
+        for j in range(i + 1, flat.shape[1]):
+            if not np.array_equal(flat[probe, i], flat[probe, j], equal_nan=True):
+                continue
+            whole = np.isfinite(flat[:, i])
+            if np.array_equal(flat[:, i], flat[:, j], equal_nan=True) and whole.any() and np.ptp(flat[whole, i]) > 0:
+                found.append((i // 3, i % 3, j // 3, j % 3))
+    return found
+
+
+def new_share(field: Floats) -> float:
+    """The share of samples that differ from the one before: below 1 where a sensor is slower than the recording.
+
+    Args:
+        field: (N, 3) nT.
+    """
+    return float(1.0 - (field[1:] == field[:-1]).all(axis=1).mean()) if len(field) > 1 else 1.0
