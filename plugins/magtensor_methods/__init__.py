@@ -1,1 +1,13 @@
+"""The published methods, built in as plugins."""
 
+from magtensor_methods.chi2017 import chi2017 as chi2017
+from magtensor_methods.chi2017 import procrustes as procrustes
+from magtensor_methods.li2018 import li2018 as li2018
+from magtensor_methods.li2018 import li2018_linear as li2018_linear
+from magtensor_methods.li2018 import li2018_lm as li2018_lm
+from magtensor_methods.linear_regression import linear_regression as linear_regression
+from magtensor_methods.pang2013 import pang2013 as pang2013
+from magtensor_methods.yin2014 import yin2014 as yin2014
+from magtensor_methods.yin2014 import yin2014_linear as yin2014_linear
+from magtensor_methods.yin2015 import eigen_square_root as eigen_square_root
+from magtensor_methods.zhang2015 import zhang2015 as zhang2015

@@ -1,0 +1,305 @@
+"""Do the attitudes determine the nine parameters of a scalar calibration? If not, which are missing?
+
+Two questions are asked, because either alone can be fooled.
+
+1. Is there one quadric only? Raw output lies on the sensor's ellipsoid. If a second quadric passes through the
+   samples as well (a plane pair when the rotation was planar, a cone when it was about one axis), any mixture of
+   the two fits, and a tiny residual says nothing. Taubin's distance, sqrt(v'Dv / v'Gv) with D the Gram matrix of
+   the design and G that of its gradients, is the root-mean-square distance in nT of the samples to the quadric v,
+   and pure noise of standard deviation s puts it at s. So the second smallest distance must exceed the smallest
+   by a clear factor. Where two quadrics fit to within the noise, the two squared distances are the eigenvalues
+   l1 <= l2 of a Wishart matrix with n = N - 8 degrees of freedom, and 2 sqrt(l1 l2)/(l1 + l2) <= w with
+   probability w^(n-1) (the sphericity test in two dimensions). The factor required is the one that this null
+   exceeds once in a thousand, and never below ten: at ten, noise makes up 1 % of the information in the weakest
+   direction, and the attenuation it causes stays as small.
+2. Are the predicted errors tolerable? The standard deviation of |b| that the covariance of the fit predicts, in
+   the worst direction of the whole sphere, must stay below a stated fraction of F. This catches what is unique
+   but weak: few samples, small tilts.
+
+With many samples noise alone would pass the second question; with ten samples it may pass the first.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from magtensor.errors import NotEnoughData
+
+from .covariance import scalar_noise
+from .quadric import design
+from .types import Array
+
+LEAST_SAMPLES = 10  # nine parameters and one sample to judge them by
+FALSE_ALARM = 1e-3  # probability that noise alone passes for a second, distinct quadric
+LEAST_RATIO = 10.0
+RESOLUTION = 1e-6  # of F: below this no sensor follows a quadric, so a smaller distance is no evidence
+WORST_ERROR = 0.02  # of F
+UNSEEN = 45.0  # deg: a half axis with no sample nearer counts as never seen
+SAME_ATTITUDE = 1e-3  # of F
+
+
+@dataclass(frozen=True)
+class Cone:
+    """A cone of field directions, in the sensor's axes, that holds no sample."""
+
+    axis: tuple[float, float, float]
+    half_angle_deg: float
+
+    def __str__(self) -> str:
+        x, y, z = self.axis
+        return f"{self.half_angle_deg:.0f} deg around ({x:+.2f}, {y:+.2f}, {z:+.2f})"
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """What the attitudes of one sensor's samples can determine.
+
+    Attributes:
+        samples, distinct: number of samples, and of attitudes that differ by more than 0.1 % of F.
+        condition_number: of the Jacobian of |b|/F with dimensionless parameters.
+        distance: nT, root-mean-square distance of the samples to the quadric nearest to them.
+        second_distance: nT, the same for the next quadric; the larger, the better the coverage.
+        required_distance: nT, what `second_distance` has to exceed.
+        worst_error: nT, predicted standard deviation of |b| in the worst direction of the sphere; infinite
+            where the fit leaves nothing to predict it from, NaN where no fit was given.
+        accepted_error: nT, what `worst_error` may reach.
+        empty_cones: the largest cones of directions without a sample, largest first.
+        unseen: half axes ("+x" ... "-z") that the field never came near.
+        still: axes whose output never changed by more than 0.1 % of F.
+    """
+
+    samples: int
+    distinct: int
+    condition_number: float
+    distance: float
+    second_distance: float
+    required_distance: float
+    worst_error: float
+    accepted_error: float
+    empty_cones: tuple[Cone, ...]
+    unseen: tuple[str, ...]
+    still: tuple[str, ...]
+
+    @property
+    def faults(self) -> tuple[str, ...]:
+        """Why the nine parameters are not determined; empty where they are."""
+        found = []
+        if self.samples < LEAST_SAMPLES or self.distinct < 9:
+            found.append(
+                f"{self.samples} samples in {self.distinct} distinct attitudes, "
+                f"where nine attitudes and {LEAST_SAMPLES} samples are the least"
+            )
+        elif self.second_distance <= self.required_distance:
+            found.append(
+                f"a second quadric surface passes within {self.second_distance:.3g} nT of the samples "
+                f"(more than {self.required_distance:.3g} nT is needed to tell it from noise)"
+            )
+        elif self.worst_error > self.accepted_error:
+            found.append(
+                f"the predicted standard deviation of |b| reaches {self.worst_error:.3g} nT "
+                f"in some direction ({self.accepted_error:.3g} nT is accepted)"
+            )
+        return tuple(found)
+
+    @property
+    def determined(self) -> bool:
+        """Whether the attitudes determine the nine parameters."""
+        return not self.faults
+
+    @property
+    def missing(self) -> str:
+        """The attitudes that are missing, in words; empty where the directions are well spread."""
+        words = []
+        if self.still:
+            words.append(f"the {' and '.join(self.still)} output never changed")
+        if self.unseen:
+            words.append(f"the field never came within {UNSEEN:.0f} deg of the sensor's {', '.join(self.unseen)}")
+        if self.empty_cones:
+            words.append(f"largest cone without a sample: {self.empty_cones[0]}")
+        return "; ".join(words)
+
+
+def coverage(
+    raw: Array,
+    total_field: Array,
+    *,
+    matrix: Array | None = None,
+    offset: Array | None = None,
+    worst_error: float = WORST_ERROR,
+) -> Coverage:
+    """Judge the attitudes of one sensor, with the fit where there is one.
+
+    Parameters
+    ----------
+    raw: (N, 3) nT, finite.
+    total_field: (N,) nT, positive.
+    matrix, offset: the fitted correction b = matrix @ (m - offset); without them only the quadrics are judged.
+    worst_error: accepted standard deviation of |b| in the worst direction, as a fraction of F.
+    """
+    field = float(np.mean(total_field))
+    centre = np.zeros(3) if offset is None else offset
+    points = (centre + (raw - centre) * (field / total_field)[:, None]) / field
+    first, second = _quadric_distances(points)
+    noise = max(first * np.sqrt(len(raw) / max(len(raw) - 9, 1)), RESOLUTION)
+    directions = _directions(points, centre / field)
+    worst = float("nan")
+    condition = _condition(_attitude_design(directions))
+    if matrix is not None:
+        b = (raw - centre) @ matrix.T
+        attitude = _attitude_design(b / np.linalg.norm(b, axis=1, keepdims=True))
+        condition = _condition(attitude)
+        worst = _worst_error(attitude, matrix, centre, raw, total_field)
+    cones = _empty_cones(directions)
+    return Coverage(
+        samples=len(raw),
+        distinct=len(np.unique(np.round(points / SAME_ATTITUDE), axis=0)),
+        condition_number=condition,
+        distance=first * field,
+        second_distance=second * field,
+        required_distance=_required_ratio(len(raw)) * noise * field,
+        worst_error=worst,
+        accepted_error=worst_error * field,
+        empty_cones=cones,
+        unseen=_unseen(directions),
+        still=tuple(a for a, spread in zip("xyz", np.ptp(points, axis=0), strict=True) if spread < SAME_ATTITUDE),
+    )
+
+
+def require_coverage(found: Coverage) -> None:
+    """Refuse a fit whose attitudes do not determine it.
+
+    Raises
+    ------
+    NotEnoughData: with the condition number and the directions that were never seen.
+    """
+    if found.determined:
+        return
+    missing = f": {found.missing}" if found.missing else ""
+    raise NotEnoughData(
+        f"the attitudes do not determine scale factors, angles and offsets: {'; '.join(found.faults)}; "
+        f"condition number {found.condition_number:.2g}{missing}",
+        hint="turn the sensor so that the field passes through these directions too, about more than one axis",
+    )
+
+
+def _quadric_distances(points: Array) -> tuple[float, float]:
+    """The two smallest Taubin distances of points (N, 3), in their unit; chunked, so N may be large."""
+    from scipy.linalg import eigh
+
+    centre = points.mean(axis=0)
+    spread = float(np.sqrt(np.mean((points - centre) ** 2)))
+    if spread == 0.0:
+        return 0.0, 0.0
+    x_all = (points - centre) / spread
+    gradients, grams, sums = np.zeros((9, 9)), np.zeros((9, 9)), np.zeros(9)
+    for start in range(0, len(x_all), 65536):
+        x = x_all[start : start + 65536]
+        rows = design(x)[:, :9]
+        sums += rows.sum(axis=0)
+        grams += rows.T @ rows
+        for k in range(3):
+            g = _design_derivative(x, k)
+            gradients += g.T @ g
+    n = len(points)
+    # the constant term is free: its best value is the mean
+    gram = grams / n - np.outer(sums, sums) / n**2
+    # a quadric whose gradient vanishes on all samples (a double plane) would be zero over zero
+    floor = 1e-13 * np.trace(gradients) / n * np.eye(9)
+    values = eigh(gram, gradients / n + floor, eigvals_only=True)
+    first, second = np.sqrt(np.maximum(values[:2], 0.0)) * spread
+    return float(first), float(second)
+
+
+def _design_derivative(x: Array, axis: int) -> Array:
+    """Derivative (N, 9) of `quadric.design` without its constant column, along one coordinate."""
+    out = np.zeros((len(x), 9))
+    out[:, axis] = 2 * x[:, axis]
+    for column, (i, j) in ((3, (1, 2)), (4, (0, 2)), (5, (0, 1))):
+        if axis == i:
+            out[:, column] = 2 * x[:, j]
+        elif axis == j:
+            out[:, column] = 2 * x[:, i]
+    out[:, 6 + axis] = 2.0
+    return out
+
+
+def _required_ratio(samples: int) -> float:
+    """How much farther the second quadric must lie than the first (question 1 of the module)."""
+    freedom = samples - 8
+    if freedom < 2:
+        return float("inf")
+    w = FALSE_ALARM ** (1.0 / (freedom - 1))
+    return max(LEAST_RATIO, float((1 + np.sqrt(1 - w**2)) / w))
+
+
+def _attitude_design(unit: Array) -> Array:
+    """Derivatives (N, 9) of |b|/F with respect to a symmetric change of the matrix and a shift, for directions."""
+    x, y, z = unit.T
+    return np.column_stack([x * x, y * y, z * z, 2 * y * z, 2 * x * z, 2 * x * y, x, y, z])
+
+
+def _condition(attitude: Array) -> float:
+    values = np.linalg.eigvalsh(attitude.T @ attitude)
+    return float(np.sqrt(values[-1] / values[0])) if values[0] > 0 else float("inf")
+
+
+def _worst_error(attitude: Array, matrix: Array, offset: Array, raw: Array, total_field: Array) -> float:
+    """Predicted standard deviation of |b|, nT, in the worst direction of the sphere."""
+    noise = scalar_noise(matrix, offset, raw, total_field)
+    if not np.isfinite(noise):
+        return float("inf")
+    normal = attitude.T @ attitude
+    values, vectors = np.linalg.eigh(normal)
+    if values[0] <= values[-1] * 1e-15:
+        return float("inf")
+    b = (raw - offset) @ matrix.T
+    gain = np.mean(np.sum(((b / np.linalg.norm(b, axis=1, keepdims=True)) @ matrix) ** 2, axis=1))
+    sphere = _attitude_design(_sphere()) @ vectors
+    return float(noise * np.sqrt(gain * np.max(np.sum(sphere**2 / values, axis=1))))
+
+
+def _directions(points: Array, centre: Array) -> Array:
+    """Directions (N, 3) of the field in the sensor's axes, from points in units of F."""
+    shifted = points - centre
+    length = np.linalg.norm(shifted, axis=1, keepdims=True)
+    return np.divide(shifted, length, out=np.zeros_like(shifted), where=length > 0)
+
+
+def _sphere(count: int = 2000) -> Array:
+    """Directions (count, 3) spread evenly over the sphere (golden spiral): gaps below 5 deg."""
+    k = np.arange(count) + 0.5
+    z = 1 - 2 * k / count
+    turn = np.pi * (1 + np.sqrt(5.0)) * k
+    r = np.sqrt(1 - z**2)
+    return np.column_stack([r * np.cos(turn), r * np.sin(turn), z])
+
+
+def _gap_angles(directions: Array, where: Array) -> Array:
+    """Angle in deg from each direction of `where` (M, 3) to the nearest sample."""
+    from scipy.spatial import cKDTree
+
+    chord = cKDTree(directions).query(where)[0]
+    out: Array = np.degrees(2 * np.arcsin(np.clip(chord / 2, 0, 1)))
+    return out
+
+
+def _empty_cones(directions: Array, most: int = 3) -> tuple[Cone, ...]:
+    grid = _sphere()
+    gap = _gap_angles(directions, grid)
+    found: list[Cone] = []
+    while len(found) < most and len(grid) and gap.max() > 30.0:
+        k = int(np.argmax(gap))
+        axis, half = grid[k], float(gap[k])
+        found.append(Cone((float(axis[0]), float(axis[1]), float(axis[2])), half))
+        outside = grid @ axis < np.cos(np.radians(half))
+        grid, gap = grid[outside], gap[outside]
+    return tuple(found)
+
+
+def _unseen(directions: Array) -> tuple[str, ...]:
+    half_axes = np.vstack([np.eye(3), -np.eye(3)])
+    names = ("+x", "+y", "+z", "-x", "-y", "-z")
+    gap = _gap_angles(directions, half_axes)
+    return tuple(n for n, g in zip(names, gap, strict=True) if g > UNSEEN)

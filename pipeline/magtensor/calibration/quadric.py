@@ -1,0 +1,148 @@
+"""Quadric surfaces through raw output: the algebraic fits of the scalar methods.
+
+In a field of constant intensity F the raw output m lies on (m - o)^T A (m - o) = F^2 (Chi 2017 eqs. 7-14). The
+fits work on x = m / F, so that every column of the design is of order one; the ten coefficients are ordered as in
+Chi 2017 eq. 10: a, b, c, f, g, h, p, q, r, d.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from magtensor.errors import NotEnoughData
+
+from .types import Array
+
+Fit = Callable[[Array], Array]
+
+
+class NotAnEllipsoid(NotEnoughData):
+    """The quadric that fits the samples best is open (a hyperboloid, a paraboloid, a cylinder or planes)."""
+
+
+@dataclass(frozen=True)
+class Ellipsoid:
+    """(m - offset)^T shape (m - offset) = F^2, with shape (3, 3) dimensionless and offset (3,) nT."""
+
+    shape: Array
+    offset: Array
+
+
+def design(x: Array) -> Array:
+    """Rows (N, 10) of Chi 2017 eq. 11 for points x (N, 3)."""
+    x1, x2, x3 = x.T
+    return np.column_stack(
+        [x1**2, x2**2, x3**2, 2 * x2 * x3, 2 * x1 * x3, 2 * x1 * x2, 2 * x1, 2 * x2, 2 * x3, np.ones(len(x))]
+    )
+
+
+def shape_matrix(p: Array) -> Array:
+    """The symmetric matrix (3, 3) of the six leading coefficients, Chi 2017 eq. 12."""
+    a, b, c, f, g, h = p[:6]
+    return np.array([[a, h, g], [h, b, f], [g, f, c]])
+
+
+def ellipsoid_of(p: Array) -> Ellipsoid:
+    """The ellipsoid (in units of the field) of ten coefficients known up to a common factor.
+
+    Chi 2017 eqs. 12-14; the factor that eq. 14 needs follows from |B| = 1: A = A0 / (o^T A0 o - d).
+
+    Raises
+    ------
+    NotAnEllipsoid: the surface is open or has no real point.
+    """
+    a = shape_matrix(p)
+    values = np.linalg.eigvalsh(a)
+    if not np.all(np.isfinite(values)) or values[0] * values[2] <= 0 or values[1] * values[2] <= 0:
+        raise NotAnEllipsoid("the quadric that fits the raw output best is not an ellipsoid")
+    offset: Array = np.asarray(-np.linalg.solve(a, p[6:9]), dtype=np.float64)
+    factor = float(offset @ a @ offset - p[9])
+    shape = a / factor if factor != 0 else np.full((3, 3), np.nan)
+    if not np.all(np.isfinite(shape)) or shape[0, 0] <= 0:
+        raise NotAnEllipsoid("the quadric that fits the raw output best has no real point")
+    return Ellipsoid(shape, offset)
+
+
+def null_vector(x: Array) -> Array:
+    """Coefficients (10,) of unit norm with the least algebraic distance to points x (N, 3)."""
+    out: Array = np.linalg.svd(design(x), full_matrices=False)[2][-1]
+    return out
+
+
+def constant_term_normalised(x: Array) -> Array:
+    """Coefficients (10,) with d = -1: the linear system of Li 2018 eqs. 18-19 in the form that has a solution.
+
+    As printed, with the constant term V10 = R7 unknown on the left and the constant H on the right, the exact
+    solution is V = (0, ..., 0, H). Taking the constant to the right and dividing by H - R7 leaves nine unknowns
+    and no trivial solution. The origin of the raw output must lie well inside the ellipsoid.
+    """
+    nine = np.linalg.lstsq(design(x)[:, :9], np.ones(len(x)), rcond=None)[0]
+    return np.append(nine, -1.0)
+
+
+def ellipsoid_restricted(x: Array) -> Array:
+    """Coefficients (10,) of the least squares fit under an ellipsoid restriction (Chi 2017, abstract and eq. 11).
+
+    Chi names the restriction and does not print it. Used here is k J - I^2 = 1 with I = a + b + c and
+    J = ab + bc + ca - f^2 - g^2 - h^2, which at k = 4 admits ellipsoids alone and at larger k more slender ones
+    (Li and Griffiths 2004): from a large k downwards, the first whose solution is an ellipsoid.
+
+    Raises
+    ------
+    NotAnEllipsoid: not even k = 4 gives one (the samples are degenerate).
+    """
+    full = design(x)
+    triangle = np.linalg.qr(np.column_stack([full[:, 6:], full[:, :6]]))[1]
+    low, mixed, quad = triangle[:4, :4], triangle[:4, 4:], triangle[4:, 4:]
+    _, s, vt = np.linalg.svd(quad)
+    # without noise the smallest singular value is rounding; a floor keeps the division finite
+    back = vt.T / np.maximum(s, s[0] * 1e-15)
+    for k in (256.0, 64.0, 16.0, 8.0, 4.0):
+        restriction = np.diag([-1.0, -1, -1, -k, -k, -k])
+        restriction[:3, :3] += (k / 2 - 1) * (1 - np.eye(3))
+        values, vectors = np.linalg.eigh(back.T @ restriction @ back)
+        leading = back @ vectors[:, -1]
+        if values[-1] <= 0 or not np.all(np.isfinite(leading)):
+            continue
+        leading /= np.linalg.norm(leading)
+        signs = np.linalg.eigvalsh(shape_matrix(leading))
+        if signs[0] * signs[2] > 0:
+            tail = -np.linalg.lstsq(low, mixed @ leading, rcond=None)[0]
+            return np.concatenate([leading, tail])
+    raise NotAnEllipsoid("no ellipsoid fits the raw output")
+
+
+def fit_ellipsoid(raw: Array, total_field: Array, fit: Fit) -> Ellipsoid:
+    """Fit an ellipsoid where the total field may differ from sample to sample.
+
+    Each sample is moved along its radius from the centre to where it would lie in the mean field, and the fit
+    repeated until the centre rests: the fixed point minimises the algebraic distance of the F-normalised model.
+    With a constant field the first fit is final.
+
+    Parameters
+    ----------
+    raw: (N, 3) nT.
+    total_field: (N,) nT, positive.
+    fit: one of the fits of this module, from points to ten coefficients.
+
+    Raises
+    ------
+    NotAnEllipsoid: the best quadric is not an ellipsoid.
+    """
+    field = float(np.mean(total_field))
+    stretch = (field / total_field)[:, None]
+    constant = bool(np.all(total_field == total_field[0]))
+    centre = np.zeros(3)
+    for _ in range(100):
+        found = ellipsoid_of(fit((centre + (raw - centre) * stretch) / field))
+        step = found.offset * field - centre
+        centre = found.offset * field
+        if constant or np.linalg.norm(step) < 1e-10 * field:
+            return Ellipsoid(found.shape, centre)
+    raise NotAnEllipsoid(
+        "the ellipsoid's centre does not settle under this variation of the total field",
+        hint="check that the reference total field belongs to these samples",
+    )
