@@ -1,0 +1,143 @@
+"""What several sensors have in common: the field, and nothing else.
+
+Sensors that see one field b(t) give raw outputs x = C b + o + noise in 3 S dimensions: a three-dimensional plane
+with noise around it. The plane is found from second moments alone, without the attitude, the total field or any
+start value: with the noise of every axis made equal, it is spanned by the three leading principal axes, which is
+the maximum-likelihood answer. What is left perpendicular to it, 3 S - 3 values a sample, is what METHODS A2 calls
+the residual after the unknown field has been projected off.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from magtensor.errors import NotEnoughData
+
+from .types import Array
+
+LEAST_SAMPLES_PER_AXIS = 20  # below this the noise is taken as equal on all axes of the array
+LEAST_SHARE = 0.05  # of the array's mean noise variance: a smaller estimate is a Heywood case, not a quiet axis
+_CHUNK = 65536
+
+
+@dataclass(frozen=True)
+class CommonField:
+    """The plane that raw outputs share, in outputs divided by their noise.
+
+    Attributes:
+        noise: (3 S,) nT, standard deviation of each output.
+        basis: (3 S, 3), orthonormal, spans the plane.
+        mean: (3 S,) of the whitened outputs; a point of the plane.
+        samples: how many were used.
+        chi2: mean square of the whitened residual per degree of freedom; 1 where the noise was estimated here.
+    """
+
+    noise: Array
+    basis: Array
+    mean: Array
+    samples: int
+    chi2: float
+
+    def coordinates(self, raw: Array) -> Array:
+        """(N, 3) coordinates in the plane of raw (N, S, 3) nT; their noise has unit variance."""
+        out: Array = (raw.reshape(len(raw), -1) / self.noise) @ self.basis
+        return out
+
+    def residual(self, raw: Array) -> Array:
+        """(N, 3 S) whitened residual perpendicular to the plane."""
+        x = raw.reshape(len(raw), -1) / self.noise - self.mean
+        out: Array = x - (x @ self.basis) @ self.basis.T
+        return out
+
+
+def common_field(raw: Array, noise: Array | None = None, keep: Array | None = None) -> CommonField:
+    """Find the plane, and the noise of each output unless it is given.
+
+    Parameters
+    ----------
+    raw: (N, S, 3) nT, finite.
+    noise: (S, 3) nT; estimated from the residual itself when None (needs at least two sensors).
+    keep: (N,) samples to use.
+
+    Raises
+    ------
+    NotEnoughData: fewer than five samples, or the field never left a plane through the outputs.
+    """
+    used = raw if keep is None else raw[keep]
+    count, size = len(used), 3 * raw.shape[1]
+    if count < 5:
+        raise NotEnoughData(f"{count} samples cannot tell the field from the sensors", hint="five attitudes are the least")
+    mean, moments = _moments(used)
+    if noise is not None:
+        sd = np.asarray(noise, dtype=float).ravel()
+        basis, own = _plane(moments / np.outer(sd, sd))
+    elif size == 3:
+        sd, basis, own = np.ones(3), np.eye(3), np.zeros((3, 3))
+    else:
+        sd, basis, own = _with_noise(moments, count)
+    if size > 3:
+        freedom = (size - 3) * (count - 4) / count  # three coordinates a sample, and the plane's own parameters
+        chi2 = float(np.trace(own) / max(freedom, 1e-9)) if count > 4 else float("nan")
+    else:
+        chi2 = float("nan")
+    return CommonField(sd, _handed(basis), mean / sd, count, chi2)
+
+
+def _handed(basis: Array) -> Array:
+    """The same plane with the coordinates as right-handed as most sensors are."""
+    determinants = np.linalg.det(basis.reshape(-1, 3, 3))
+    flip = 1.0 if determinants.sum() >= 0 else -1.0
+    return basis * np.array([flip, 1.0, 1.0])
+
+
+def _moments(raw: Array) -> tuple[Array, Array]:
+    """Mean (3 S,) and covariance (3 S, 3 S) of raw outputs, in chunks."""
+    flat = raw.reshape(len(raw), -1)
+    centre = flat[0]
+    total, square = np.zeros(flat.shape[1]), np.zeros((flat.shape[1],) * 2)
+    for start in range(0, len(flat), _CHUNK):
+        part = flat[start : start + _CHUNK] - centre
+        total += part.sum(axis=0)
+        square += part.T @ part
+    mean = total / len(flat)
+    return mean + centre, square / len(flat) - np.outer(mean, mean)
+
+
+def _plane(moments: Array) -> tuple[Array, Array]:
+    """The three leading axes (n, 3) of whitened moments, and the moments perpendicular to them."""
+    values, vectors = np.linalg.eigh(moments)
+    basis = vectors[:, -3:][:, ::-1]
+    if values[-3] <= 1e-12 * values[-1]:
+        raise NotEnoughData(
+            "the outputs never leave a plane: the field was never turned about a second axis",
+            hint="turn the array about more than one axis",
+        )
+    own = moments - (basis * values[-3:][::-1]) @ basis.T
+    return basis, own
+
+
+def _with_noise(moments: Array, count: int) -> tuple[Array, Array, Array]:
+    """Noise of each output, plane and perpendicular moments, by alternating between the two.
+
+    Below `LEAST_SAMPLES_PER_AXIS` samples an axis, and with two sensors (whose axes share one residual), all
+    outputs are given the same noise.
+    """
+    size = len(moments)
+    sd = np.ones(size)
+    basis, own = _plane(moments)
+    sd *= np.sqrt(max(np.trace(own), 1e-300) * count / (max(count - 4, 1) * (size - 3)))
+    if size <= 6 or count < LEAST_SAMPLES_PER_AXIS * size:
+        basis, own = _plane(moments / np.outer(sd, sd))
+        return sd, basis, own
+    for _ in range(200):
+        basis, own = _plane(moments / np.outer(sd, sd))
+        share = 1.0 - np.sum(basis**2, axis=1)
+        variance = np.diag(own) / np.maximum(share, 1e-6) * count / (count - 4)
+        step = np.sqrt(np.clip(variance, 0.1, 10.0))
+        sd = np.maximum(sd * step, np.sqrt(LEAST_SHARE * np.mean(sd**2)))
+        if np.max(np.abs(step - 1)) < 1e-6:
+            break
+    basis, own = _plane(moments / np.outer(sd, sd))
+    return sd, basis, own
