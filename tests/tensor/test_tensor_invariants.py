@@ -19,9 +19,9 @@ def rotation(q):
 
 def test_dipole_tensor_of_the_tests_is_the_derivative_of_its_field():
     point, moment, h = np.array([1.0, -2.0, 1.5]), np.array([3.0, 1.0, -2.0]), 1e-5
-    numeric = np.stack(
-        [(dipole_field(point + e, moment) - dipole_field(point - e, moment)) / (2 * h) for e in h * np.eye(3)], axis=1
-    )
+    steps = h * np.eye(3)
+    numeric = np.stack([dipole_field(point + e, moment) - dipole_field(point - e, moment) for e in steps], axis=1)
+    numeric /= 2 * h
     np.testing.assert_allclose(dipole_tensor(point, moment), numeric, rtol=1e-8, atol=1e-8)
 
 
@@ -39,9 +39,8 @@ def test_five_and_full_and_their_rotation(g, q):
 def test_generators_are_the_derivative_of_the_representation():
     h = 1e-6
     for k in range(3):
-        axis = np.zeros(4)
-        axis[k] = np.sin(h / 2)
-        plus, minus = axis + [0, 0, 0, np.cos(h / 2)], [0, 0, 0, np.cos(h / 2)] - axis
+        plus, minus = np.array([0, 0, 0, np.cos(h / 2)]), np.array([0, 0, 0, np.cos(h / 2)])
+        plus[k], minus[k] = np.sin(h / 2), -np.sin(h / 2)
         numeric = (rotation_of_five(rotation(plus)) - rotation_of_five(rotation(minus))) / (2 * h)
         np.testing.assert_allclose(GENERATORS[k], numeric, atol=1e-9)
 

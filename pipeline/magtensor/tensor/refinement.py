@@ -1,0 +1,146 @@
+"""What a refinement of the tensor by its invariants is, and its gauge.
+
+The correction of five measured components T5 is G5 = H T5 + D (Sui 2017 eq. 9). The invariants do not change
+when all corrected tensors turn together, so H and D are known only up to a common rotation Q: S(Q) H and S(Q) D
+fit exactly as well, S(Q) being the 5x5 representation of Q.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magtensor.tensor.elements import GENERATORS, METRIC, NINE_OF_FIVE, five, full, rotation_of_five
+
+Array = NDArray[np.float64]
+
+UNIDENTIFIED = (
+    "the orientation of the corrected tensor is unidentified: rotating all of it changes no invariant; given is "
+    "the representative nearest to the prior"
+)
+
+
+@dataclass(frozen=True)
+class TensorCalibration:
+    """The correction G5 = matrix @ T5 + offset of the components xx, xy, xz, yy, yz.
+
+    Attributes:
+        matrix: (5, 5) dimensionless, H of Sui 2017 eq. 9.
+        offset: (5,) nT/m, D of eq. 9.
+        covariance: (30, 30) of H row by row, then D; zero along the gauge, whose choice is a convention.
+        rank, nullity: of the derivative of both invariants at all samples by the 30 coefficients.
+        gauge: (3, 30) the coefficients' change under a small rotation about x, y, z; no data determine it.
+        gauge_angle: rad, by which the solver's result was turned to the representative nearest to the prior.
+        triaxiality: |det G| scaled to 1 for an axisymmetric source (eigenvalues 2, -1, -1), where 15 coefficients
+            are lost, and 0 where one eigenvalue vanishes and the sign of H is lost.
+        quadric_condition, cubic_condition: largest over smallest singular value of the two designs.
+        noise_std: nT/m, of one component, estimated from the fit.
+        residual_rms: of I1 and I2 after the correction, relative to (C_T)^2 and (C_T)^3.
+        verdict: what a user has to know, in words.
+        diagnostics: further figures.
+    """
+
+    matrix: Array
+    offset: Array
+    covariance: Array
+    rank: int
+    nullity: int
+    gauge: Array
+    gauge_angle: float
+    triaxiality: float
+    quadric_condition: float
+    cubic_condition: float
+    noise_std: float
+    residual_rms: tuple[float, float]
+    verdict: tuple[str, ...]
+    diagnostics: Mapping[str, float] = field(default_factory=dict)
+
+    def apply(self, tensor: Array) -> Array:
+        """Corrected tensors (..., 3, 3) nT/m, symmetric and traceless, from measured ones."""
+        return full(five(tensor) @ self.matrix.T + self.offset)
+
+
+def normalised_determinant(invariant_1: float, invariant_2: float) -> float:
+    """det G as a fraction of the largest that a tensor of this magnitude can have; between -1 and 1."""
+    return float(3 * np.sqrt(6) * invariant_2 / (-2 * invariant_1) ** 1.5)
+
+
+def invariant_jacobian(measured: Array, matrix: Array, offset: Array) -> Array:
+    """d(I1, I2)/d(H row by row, D) at all samples, (2 N, 30).
+
+    Parameters
+    ----------
+    measured : (N, 5) in units in which the tensors are of order one.
+    """
+    g = measured @ matrix.T + offset
+    whole = full(g)
+    cofactors = np.stack([np.cross(whole[:, (i + 1) % 3], whole[:, (i + 2) % 3]) for i in range(3)], axis=1)
+    slopes = (-g @ METRIC, cofactors.reshape(-1, 9) @ NINE_OF_FIVE)
+    by_matrix = [np.einsum("na,nb->nab", slope, measured).reshape(-1, 25) for slope in slopes]
+    return np.vstack([np.hstack([m, slope]) for m, slope in zip(by_matrix, slopes, strict=True)])
+
+
+def coefficient_rank(measured: Array, matrix: Array, offset: Array) -> int:
+    """How many of the 30 coefficients the two invariants at all samples determine; 27 at most.
+
+    Parameters as in `invariant_jacobian`. Noise fills directions that the true tensors leave empty:
+    `magtensor.tensor.excitation` tells those apart.
+    """
+    jacobian = invariant_jacobian(measured, matrix, offset)
+    singular = np.linalg.svd(jacobian, compute_uv=False)
+    return int(np.sum(singular > 1e-9 * singular[0]))
+
+
+def gauge_directions(matrix: Array, offset: Array) -> Array:
+    """(3, 30): the change of H row by row and of D for a small rotation of the corrected tensors about x, y, z."""
+    return np.stack([np.concatenate([(k @ matrix).ravel(), k @ offset]) for k in GENERATORS])
+
+
+def nearest_in_gauge(matrix: Array, target: Array) -> tuple[Array, float]:
+    """The rotation Q (3, 3) that brings S(Q) `matrix` nearest to `target`, and its angle in rad.
+
+    Near in the norm tr(X' METRIC X METRIC^-1), which itself does not depend on the orientation of the axes. Gauss-
+    Newton steps from no rotation and from the 23 rotations of the cube, so that a prior far away does no harm.
+    """
+    from scipy.spatial.transform import Rotation
+
+    left = np.asarray(np.linalg.cholesky(METRIC).T, dtype=np.float64)
+    right = np.asarray(np.linalg.inv(left), dtype=np.float64)
+    goal = left @ target @ right
+    best: tuple[float, Array] | None = None
+    for start in Rotation.create_group("O").as_matrix():
+        rotation = _descend(left, right, matrix, goal, start)
+        distance = float(np.linalg.norm(left @ rotation_of_five(rotation) @ matrix @ right - goal))
+        if best is None or distance < best[0] - 1e-12:
+            best = distance, rotation
+    assert best is not None
+    return best[1], float(Rotation.from_matrix(best[1]).magnitude())
+
+
+def _descend(left: Array, right: Array, matrix: Array, goal: Array, rotation: Array) -> Array:
+    from scipy.spatial.transform import Rotation
+
+    for _ in range(50):
+        turned = rotation_of_five(rotation) @ matrix
+        slope = np.stack([(left @ k @ turned @ right).ravel() for k in GENERATORS], axis=1)
+        step = np.linalg.lstsq(slope, (goal - left @ turned @ right).ravel(), rcond=None)[0]
+        rotation = Rotation.from_rotvec(step).as_matrix() @ rotation
+        if np.linalg.norm(step) < 1e-13:
+            break
+    return rotation
+
+
+def gauge_projection(matrix: Array, target: Array) -> Array:
+    """(25, 25): how errors of H change when the gauge is fixed again by `nearest_in_gauge`.
+
+    At the nearest representative <K_k H, target> = 0 for the three generators K; an error dH is followed by the
+    small rotation that restores it.
+    """
+    weigh = METRIC @ target @ np.linalg.inv(METRIC)
+    moved = np.stack([(k @ matrix).ravel() for k in GENERATORS], axis=1)
+    condition = np.stack([(k.T @ weigh).ravel() for k in GENERATORS])
+    out: Array = np.eye(25) - moved @ np.linalg.solve(condition @ moved, condition)
+    return out
