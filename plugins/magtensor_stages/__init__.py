@@ -2,6 +2,7 @@
 
 from magtensor_stages.array import align as align
 from magtensor_stages.array import assemble_tensor as assemble_tensor
+from magtensor_stages.diurnal import detrend_diurnal as detrend_diurnal
 from magtensor_stages.load import load as load
 from magtensor_stages.quality import qc as qc
 from magtensor_stages.sensors import calibrate_array as calibrate_array

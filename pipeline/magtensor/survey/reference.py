@@ -1,0 +1,94 @@
+"""The scalar reference at the array's times: interpolation that does not overshoot, gaps, spikes, uncertainty."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magtensor.survey.checks import resolution
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+SPIKE_WINDOW = 7  # samples; three good neighbours on each side outvote a spike of up to three samples
+
+
+@dataclass(frozen=True)
+class Sampled:
+    """A record at other times.
+
+    Attributes:
+        values: (M,) NaN where the record does not cover.
+        covered: (M,).
+        weight_norm: (M,) by how much independent noise of the record's samples is scaled at each time.
+    """
+
+    values: Floats
+    covered: Bools
+    weight_norm: Floats
+
+
+def sample(at: Floats, time: Floats, values: Floats, *, smooth: bool, max_gap_s: float) -> Sampled:
+    """A record at other times, never above or below the two samples between which a time lies.
+
+    Args:
+        at: (M,) s.
+        time: (N,) s, strictly increasing, N >= 1.
+        values: (N,) finite.
+        smooth: monotone cubic (Fritsch and Carlson 1980, as PCHIP) instead of straight lines.
+        max_gap_s: a longer step of the record is a gap, and so is everything beyond its ends by more than one
+            median step; within one median step of an end the end's value holds.
+    """
+    if len(time) == 1:
+        covered = np.abs(at - time[0]) <= max_gap_s
+        return Sampled(np.where(covered, values[0], np.nan), covered, np.ones(len(at)))
+    steps = np.diff(time)
+    edge = min(float(np.median(steps)), max_gap_s)
+    inside = np.clip(at, time[0], time[-1])
+    right = np.clip(np.searchsorted(time, inside, side="right"), 1, len(time) - 1)
+    step = steps[right - 1]
+    weight = (inside - time[right - 1]) / step
+    on_sample = (weight == 0.0) | (weight == 1.0)
+    covered = (np.abs(at - inside) <= edge) & ((step <= max_gap_s) | on_sample)
+    if smooth and len(time) > 2:
+        from scipy.interpolate import PchipInterpolator
+
+        found = PchipInterpolator(time, values)(inside)
+        low, high = np.minimum(values[right - 1], values[right]), np.maximum(values[right - 1], values[right])
+        found = np.clip(found, low, high)  # the last bit of rounding may overshoot
+    else:
+        found = values[right - 1] * (1.0 - weight) + values[right] * weight
+    found = np.where(weight == 1.0, values[right], np.where(weight == 0.0, values[right - 1], found))
+    return Sampled(np.where(covered, found, np.nan), covered, np.hypot(1.0 - weight, weight))
+
+
+def spikes(values: Floats, threshold: float) -> Bools:
+    """(N,) True where a sample leaves the running median by more than `threshold` robust standard deviations.
+
+    The deviation's scale is 1.4826 times its median magnitude over the whole record, and at least the record's
+    resolution: a proton magnetometer that rounds to 0.1 nT repeats itself for long.
+
+    Args:
+        values: (N,) finite.
+        threshold: standard deviations.
+    """
+    from scipy.ndimage import median_filter
+
+    off = np.abs(values - median_filter(values, SPIKE_WINDOW, mode="nearest"))
+    scale = max(1.4826 * float(np.median(off)), resolution(values))
+    return off > threshold * scale if scale > 0 else off > 0
+
+
+def noise(values: Floats) -> float:
+    """Standard deviation of one sample, from second differences and the resolution; an upper bound where it curves.
+
+    Args:
+        values: (N,) nT.
+    """
+    step = resolution(values)
+    if len(values) < 3:
+        return step / np.sqrt(12.0)
+    second = np.diff(values, 2)
+    return float(np.hypot(1.4826 * np.median(np.abs(second)) / np.sqrt(6.0), step / np.sqrt(12.0)))
