@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -79,6 +79,16 @@ def run_recipe(
         planned = again(recipe, before, overrides=overrides, plugin_folders=plugin_folders, survey=survey)
     else:
         planned = read_plan(recipe, overrides=overrides, plugin_folders=plugin_folders, survey=survey)
+    finished = run_plan(planned, output, verify=verify, progress=progress)
+    if before is not None and not overrides and survey is None:
+        return replace(finished, notes=compare(before, finished.made_by))
+    return finished
+
+
+def run_plan(
+    planned: Plan, output: Path, *, verify: Path | None = None, progress: Callable[[str], None] | None = None
+) -> Finished:
+    """Run a plan and write the files of the contract; as `run_recipe`."""
     source = planned.source()
     if progress is not None:
         progress("start")
@@ -86,8 +96,7 @@ def run_recipe(
     made_by = provenance.collect(planned, done.records, source.files())
     outcome = verdict(done.survey, verify=verification(done.survey, verify, planned) if verify else None)
     made_by = result.write(output, done.survey, made_by, outcome)
-    notes = compare(before, made_by) if before is not None and not overrides and survey is None else ()
-    return Finished(output, outcome, sentence(outcome), made_by, done.survey, notes)
+    return Finished(output, outcome, sentence(outcome), made_by, done.survey)
 
 
 def again(
@@ -150,8 +159,6 @@ def load_as(planned: Plan, path: Path, *, tolerant: bool = False) -> Survey:
     A stage whose variables this survey lacks is left out; `tolerant` also leaves out one that the data refuse, as
     long as the survey itself was read (a field needs no base station to be corrected).
     """
-    from dataclasses import replace
-
     stages = []
     for stage in planned.stages:
         if any(p.startswith("calibration/") for p in (*stage.declares.gives, *stage.declares.needs)):
