@@ -53,6 +53,7 @@ def _label(component: Component) -> str:
 def show_plugins(registry: Registry) -> None:
     """Print a table of plugins, then one of components."""
     from rich.console import Console
+    from rich.markup import escape
     from rich.table import Table
 
     console = Console()
@@ -68,7 +69,7 @@ def show_plugins(registry: Registry) -> None:
     for column in ("kind", "name", "what it does"):
         components.add_column(column, overflow="fold")
     for (kind, step, name), component in sorted(registry.components.items()):
-        components.add_row(f"{kind} of {step}" if step else kind, name, component.summary)
+        components.add_row(f"{kind} of {step}" if step else kind, name, escape(component.summary))
     console.print(components)
 
 

@@ -7,3 +7,4 @@ from magtensor_stages.load import load as load
 from magtensor_stages.quality import qc as qc
 from magtensor_stages.sensors import calibrate_array as calibrate_array
 from magtensor_stages.sensors import calibrate_scalar as calibrate_scalar
+from magtensor_stages.sensors import calibrate_vector as calibrate_vector

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from magtensor import DataError, MethodChoice, NotEnoughData, stage
 from magtensor.calibrated import contrasts, corrected, stored
-from magtensor.calibration.types import ArrayCalibration, SensorCalibration
+from magtensor.calibration.types import PARAMETERS_PER_SENSOR, ArrayCalibration, SensorCalibration
+from magtensor.survey.flags import flag_ranges
 
 if TYPE_CHECKING:
     from magtensor.survey.model import Survey
@@ -81,15 +83,55 @@ def calibrate_scalar(survey: Survey, *, method: MethodChoice = "chi2017") -> dic
     return stored(together, survey.sensors, method=method.__name__) | per_sensor(fits) | corrected(together, survey)
 
 
-@stage(needs=("b_raw", "total_field"), gives=(*FITTED, "calibration/rotation", "residual/contrast"))
-def calibrate_array(survey: Survey, *, method: MethodChoice = "li2018") -> dict[str, Any]:
+COMMON = (*FITTED, "calibration/rotation")
+
+
+@stage(needs=("b_raw", "total_field"), gives=COMMON, may_give=("residual/contrast", "good"))
+def calibrate_array(survey: Survey, *, method: MethodChoice = "joint") -> dict[str, Any]:
     """Calibrate all sensors at once into one common frame.
 
-    A method is ``f(raw (N, S, 3) nT, total_field (N,) nT, *, options) -> ArrayCalibration``.
+    A method is ``f(raw (N, S, 3) nT, total_field (N,) nT, *, options) -> ArrayCalibration``. Samples that the
+    method does not believe are flagged.
     """
     raw, total_field = survey.values("b_raw"), survey.values("total_field")
     good = survey.good & np.isfinite(total_field) & np.isfinite(raw).all(axis=(1, 2))
-    return common_frame(survey, method(raw[good], total_field[good]), method.__name__)
+    if not good.any():
+        raise NotEnoughData("no sample has all sensors in use and a total field")
+    calibration = method(raw[good], total_field[good])
+    given = common_frame(survey, calibration, method.__name__)
+    if calibration.kept is not None and not calibration.kept.all():
+        doubted = np.zeros(len(good), dtype=bool)
+        doubted[good] = ~calibration.kept
+        given["good"] = (("time", "sensor"), survey.good_by_sensor & ~doubted[:, None], {"long_name": "may be used"})
+        reason = "no calibration and no noise explain it"
+        given["flags"] = flag_ranges(survey.time, doubted, by="calibrate_array", reason=reason)
+    return given
+
+
+@stage(
+    needs=("b_raw", "attitude", "reference/world_field"),
+    uses=("total_field",),
+    gives=("calibration/*", "calibration/rotation", "calibrated/b", "residual/vector"),
+    may_give=("residual/contrast", "residual/total_field", "residual/total_field_before"),
+)
+def calibrate_vector(survey: Survey, *, method: MethodChoice = "linear_regression") -> dict[str, Any]:
+    """Calibrate each sensor against a known vector: the world field turned into the platform by the attitude.
+
+    A method is ``f(raw (N, 3) nT, field (N, 3) nT in the platform frame, *, options) -> SensorCalibration``. All
+    twelve parameters are determined, the rotation too.
+    """
+    from magtensor.attitude import into_platform
+
+    field = into_platform(survey.values("attitude"), survey.values("reference/world_field"))
+    known = np.isfinite(field).all(axis=1)
+    raw = survey.values("b_raw")
+    fits = each_sensor(survey, lambda i, good: method(raw[good & known, i], field[good & known]))
+    together = replace(side_by_side(fits), frame="platform", unobservable=())
+    given = common_frame(survey, together, method.__name__) | per_sensor(fits)
+    residual = together.apply(np.asarray(raw, dtype=float)) - field[:, None]
+    attributes = {"units": "nT", "long_name": "b - known field"}
+    given["residual/vector"] = (("time", "sensor", "axis"), residual, attributes)
+    return given
 
 
 def common_frame(survey: Survey, calibration: ArrayCalibration, method: str) -> dict[str, Any]:
@@ -100,4 +142,34 @@ def common_frame(survey: Survey, calibration: ArrayCalibration, method: str) -> 
     rotation = np.stack([rotation_and_upper(m)[0] for m in calibration.matrix])
     attributes = {"units": "1", "frame": calibration.frame, "long_name": "sensor (z along its z axis) to common frame"}
     given["calibration/rotation"] = (("sensor", "axis", "sensor_axis"), rotation, attributes)
-    return given | contrasts(calibration.apply(np.asarray(survey.values("b_raw"), dtype=float)))
+    if len(survey.sensors) > 1:
+        given |= contrasts(calibration.apply(np.asarray(survey.values("b_raw"), dtype=float)))
+    return given | published_parameters(calibration, survey.sensors)
+
+
+def published_parameters(calibration: ArrayCalibration, sensors: list[str]) -> dict[str, Any]:
+    """Scale factors, angles and offsets in Chi's and in Li's parameters, with standard deviations.
+
+    A sensor that the correction mirrors has no such angles: its row is NaN.
+    """
+    from magtensor.calibration.parameters import CHI, LI, UNITS, parameters
+
+    given: dict[str, Any] = {}
+    size = PARAMETERS_PER_SENSOR
+    for key, convention in (("chi2017", CHI), ("li2018", LI)):
+        values, std = np.full((2, len(sensors), size), np.nan)
+        for s in range(len(sensors)):
+            block = slice(size * s, size * (s + 1))
+            try:
+                found = parameters(
+                    calibration.matrix[s], calibration.offset[s], calibration.covariance[block, block], convention
+                )
+            except DataError:
+                continue
+            values[s], std[s] = found.values, found.std
+        dims = ("sensor", f"{key}_parameter")
+        names = (dims[1:], np.array(convention.names), {"units_of_each": list(UNITS), "convention": convention.name})
+        given[f"calibration/{key}_parameter"] = names
+        given[f"calibration/{key}"] = (dims, values, {"units": f"see {key}_parameter"})
+        given[f"calibration/{key}_std"] = (dims, std, {"units": f"see {key}_parameter"})
+    return given

@@ -176,6 +176,7 @@ def calibrated(fit: JointFit, total_field: Array, raw: Array, reference_noise: f
             "chi2_contrasts": fit.plane.chi2,
             "noise_nT": float(np.sqrt(np.mean(fit.plane.noise**2))),
         },
+        fit.keep,
     )
 
 

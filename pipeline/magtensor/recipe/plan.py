@@ -248,7 +248,7 @@ class _Planner:
 
     def text(self, key: str, *, required: bool = False) -> str:
         value = self.document.value.get(key)
-        if value is None and not required:
+        if value in (None, "") and not required:
             return ""
         if not isinstance(value, str) or not value.strip():
             self.problems.add((key,) if key in self.document.value else (), f"needs a {key}, a line of text")

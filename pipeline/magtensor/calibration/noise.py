@@ -1,0 +1,50 @@
+"""The noise of the sensors, from the data themselves and not from a fit's residual."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from magtensor.calibration.types import Array
+
+MAD_TO_SIGMA = 1.482602218505602  # for a normal distribution
+
+
+def noise_std(b: Array, total_field: Array | None = None) -> Array:
+    """White-noise standard deviation of each sensor and axis, from second differences in time.
+
+    Between sensors that see one field the contrasts b_s - mean(b) hold no field, and second differences
+    (divided by sqrt 6) hold nothing slower than a few samples: what remains is the noise at the highest
+    frequencies. Slow (1/f) noise and every slow effect are left out by construction.
+
+    Args:
+        b: (N, S, 3) nT, calibrated to one frame, samples in order.
+        total_field: (N,) nT, the reference; needed for a single sensor only, where |b| - F gives the noise
+            along the field and the three axes are taken as equal.
+
+    Returns:
+        (S, 3) nT; NaN where fewer than four samples, or nothing to compare with, leave it open.
+    """
+    n, sensors, _ = b.shape
+    if n < 4 or (sensors == 1 and total_field is None):
+        return np.full((sensors, 3), np.nan)
+    if sensors == 1:
+        assert total_field is not None
+        along = np.linalg.norm(b[:, 0], axis=1) - total_field
+        return np.full((1, 3), _second_difference_std(along[:, None])[0])
+    contrasts = b - b.mean(axis=1, keepdims=True)
+    variance = _second_difference_std(contrasts.reshape(n, -1)).reshape(sensors, 3) ** 2
+    if sensors == 2:  # the two contrasts are one and the same: share the variance equally
+        return np.sqrt(2.0 * variance)
+    # var(contrast_s) = (1 - 2/S) v_s + sum(v) / S^2 and sum over s gives sum(v) (1 - 1/S)
+    total = variance.sum(axis=0) / (1.0 - 1.0 / sensors)
+    own = (variance - total / sensors**2) / (1.0 - 2.0 / sensors)
+    # a sensor much quieter than its neighbours may come out below zero by chance
+    return np.sqrt(np.maximum(own, 0.01 * total / sensors))
+
+
+def _second_difference_std(series: Array) -> Array:
+    """Robust standard deviation of white noise in each column of (N, K)."""
+    second = np.diff(series, n=2, axis=0) / np.sqrt(6.0)
+    robust = MAD_TO_SIGMA * np.median(np.abs(second - np.median(second, axis=0)), axis=0)
+    # coarse quantisation makes the median zero; the plain figure then says more
+    return np.where(robust > 0, robust, second.std(axis=0))
