@@ -37,6 +37,7 @@ from magtensor.tensor.refinement import (
     gauge_projection,
     nearest_in_gauge,
     normalised_determinant,
+    similarity,
 )
 from numpy.typing import NDArray
 from pydantic import Field
@@ -44,6 +45,7 @@ from pydantic import Field
 Array = NDArray[np.float64]
 
 WORST_MISFIT = 0.3  # of the 50 equations, relative; 0.05 is what noise makes of a barely sufficient series
+LEAST_SIMILARITY = 0.8  # of H to the prior; errors of 15 degrees and 20 % leave 0.9
 
 
 @method("refine_invariants", source="Sui et al. 2017, eqs. 9-19")
@@ -92,6 +94,8 @@ def sui2017(
     solved = solve_coefficients(equations.y, equations.z, start)
     rotation, angle = nearest_in_gauge(solved, start)
     matrix = rotation_of_five(rotation) @ solved
+    if similarity(matrix, start) < LEAST_SIMILARITY:
+        raise _other_invariants("the H that fits resembles the prior in no orientation")
     covariance = _covariance(equations, matrix, start, offset, magnitude)
     found = invariants(full(equations.t @ matrix.T))
     residual = np.sqrt(np.mean(np.square([found.i1 + 0.5, found.i2 - equations.i2]), axis=1))
@@ -183,13 +187,17 @@ def solve_coefficients(y: Array, z: Array, start: Array) -> Array:
     found = least_squares(residual, start.ravel(), jacobian, method="lm", xtol=1e-12, ftol=1e-12, max_nfev=500)
     misfit = float(np.linalg.norm(found.fun) / np.linalg.norm(target))
     if misfit > WORST_MISFIT:
-        raise DataError(
-            f"no H near the prior gives the rotated tensors these invariants: the 50 equations stay {misfit:.0%} off",
-            where="invariant_1, invariant_2",
-            hint="check the sign and the units ((nT/m)^2 and (nT/m)^3) of the invariants, and the prior",
-        )
+        raise _other_invariants(f"the 50 equations for H stay {misfit:.0%} off")
     out: Array = found.x.reshape(5, 5)
     return out
+
+
+def _other_invariants(what: str) -> DataError:
+    return DataError(
+        f"the rotated tensors do not belong to these invariants: {what}",
+        where="invariant_1, invariant_2",
+        hint="check the sign and the units of I1, (nT/m)^2, and of I2, (nT/m)^3, and the prior",
+    )
 
 
 def _covariance(equations: Equations, matrix: Array, start: Array, offset: Array, magnitude: float) -> Array:
@@ -203,9 +211,8 @@ def _covariance(equations: Equations, matrix: Array, start: Array, offset: Array
     quadric = np.hstack([quadratic_monomials(e.u), 2 * e.u])
     forms, cubes = quadratic_monomials(e.t), cubic_monomials(e.t)
     on_x = -_influence(quadric, quadric @ e.x - 1)
-    a = symmetric_matrix(e.x[:15])
     turned = np.einsum("ncd,d->nc", _symmetric_matrices(on_x[:, :15]), e.offset)
-    on_offset = -np.linalg.solve(a, (on_x[:, 15:] + turned).T).T
+    on_offset: Array = -(on_x[:, 15:] + turned) @ np.linalg.inv(symmetric_matrix(e.x[:15]))
     slope_y = -2 * e.t @ symmetric_matrix(e.y)
     slope_z = -np.einsum("npc,p->nc", cubic_derivatives(e.t), e.z)
     on_y = -_influence(forms, forms @ e.y + 0.5) - on_offset @ np.linalg.lstsq(forms, slope_y, rcond=None)[0].T
@@ -220,8 +227,8 @@ def _covariance(equations: Equations, matrix: Array, start: Array, offset: Array
 
 
 def _influence(design: Array, residual: Array) -> Array:
-    """(N, p): minus what each sample adds to the error of a least-squares fit."""
-    out: Array = np.linalg.solve(design.T @ design, (design * residual[:, None]).T).T
+    """(N, p): what each sample's residual (fitted less given) takes off the coefficients of a least-squares fit."""
+    out: Array = (design * residual[:, None]) @ np.linalg.inv(design.T @ design)
     return out
 
 

@@ -31,6 +31,7 @@ CUBIC_COEFFICIENTS = len(TRIPLES)
 _ROUNDING = 1e-14  # the least noise variance assumed, of tensors of order one
 _FALSE_ALARM = 1e-4
 _CLEARLY_VARYING = 10.0  # times the noise variance; a component below does not carry a quadric
+_STANDING_STILL = 1e-6  # of the largest variance of a component: tilts of less than a degree
 
 
 @dataclass(frozen=True)
@@ -73,6 +74,10 @@ def quadric_excitation(measured: Array) -> Excitation:
     if scale <= 1e-12 * np.abs(measured).max():
         return Excitation(0.0, 5, 0.0, 1.0, QUADRIC_COEFFICIENTS - 1)
     t = centred / scale
+    spread = np.linalg.eigvalsh(np.cov(t.T))
+    still = int(np.sum(spread < _STANDING_STILL * spread[-1]))
+    if still:
+        return Excitation(float(np.sqrt(max(spread[0], 0.0))) * scale, still, 0.0, 1.0, QUADRIC_COEFFICIENTS - 1)
     monomials = np.hstack([quadratic_monomials(t), t])
     derivatives = np.concatenate([quadratic_derivatives(t), np.broadcast_to(np.eye(5), (count, 5, 5))], axis=1)
     free = count - QUADRIC_COEFFICIENTS
@@ -81,7 +86,7 @@ def quadric_excitation(measured: Array) -> Excitation:
     needed = float(fdtri(free, free, 1 - _FALSE_ALARM))
     return Excitation(
         float(np.sqrt(noise)) * scale,
-        int(np.sum(np.linalg.eigvalsh(np.cov(t.T)) < _CLEARLY_VARYING * noise)),
+        int(np.sum(spread < _CLEARLY_VARYING * noise)),
         float(values[1]) / noise,
         needed,
         int(np.sum(values[1:] < needed * noise)),

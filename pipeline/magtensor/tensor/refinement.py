@@ -102,35 +102,31 @@ def gauge_directions(matrix: Array, offset: Array) -> Array:
 def nearest_in_gauge(matrix: Array, target: Array) -> tuple[Array, float]:
     """The rotation Q (3, 3) that brings S(Q) `matrix` nearest to `target`, and its angle in rad.
 
-    Near in the norm tr(X' METRIC X METRIC^-1), which itself does not depend on the orientation of the axes. Gauss-
-    Newton steps from no rotation and from the 23 rotations of the cube, so that a prior far away does no harm.
+    Near in the norm tr(X' METRIC X METRIC^-1), which itself does not depend on the orientation of the axes.
+    Gauss-Newton steps from the nearest of the rotations of a cube and an icosahedron: a far target does no harm.
     """
     from scipy.spatial.transform import Rotation
 
     left = np.asarray(np.linalg.cholesky(METRIC).T, dtype=np.float64)
     right = np.asarray(np.linalg.inv(left), dtype=np.float64)
     goal = left @ target @ right
-    best: tuple[float, Array] | None = None
-    for start in Rotation.create_group("O").as_matrix():
-        rotation = _descend(left, right, matrix, goal, start)
-        distance = float(np.linalg.norm(left @ rotation_of_five(rotation) @ matrix @ right - goal))
-        if best is None or distance < best[0] - 1e-12:
-            best = distance, rotation
-    assert best is not None
-    return best[1], float(Rotation.from_matrix(best[1]).magnitude())
-
-
-def _descend(left: Array, right: Array, matrix: Array, goal: Array, rotation: Array) -> Array:
-    from scipy.spatial.transform import Rotation
-
+    starts = np.concatenate([Rotation.create_group(group).as_matrix() for group in "OI"])
+    distance = np.linalg.norm(left @ rotation_of_five(starts) @ matrix @ right - goal, axis=(1, 2))
+    rotation = starts[int(np.argmin(distance))]
     for _ in range(50):
-        turned = rotation_of_five(rotation) @ matrix
-        slope = np.stack([(left @ k @ turned @ right).ravel() for k in GENERATORS], axis=1)
-        step = np.linalg.lstsq(slope, (goal - left @ turned @ right).ravel(), rcond=None)[0]
+        turned = left @ rotation_of_five(rotation) @ matrix @ right
+        slope = np.stack([(left @ k @ right @ turned).ravel() for k in GENERATORS], axis=1)
+        step = np.linalg.lstsq(slope, (goal - turned).ravel(), rcond=None)[0]
         rotation = Rotation.from_rotvec(step).as_matrix() @ rotation
         if np.linalg.norm(step) < 1e-13:
             break
-    return rotation
+    return rotation, float(Rotation.from_matrix(rotation).magnitude())
+
+
+def similarity(matrix: Array, target: Array) -> float:
+    """Cosine of the angle between two corrections in the norm of `nearest_in_gauge`: 1 if alike but for scale."""
+    weigh = lambda a, b: float(np.sum((METRIC @ a @ np.linalg.inv(METRIC)) * b))  # noqa: E731
+    return weigh(matrix, target) / float(np.sqrt(weigh(matrix, matrix) * weigh(target, target)))
 
 
 def gauge_projection(matrix: Array, target: Array) -> Array:
