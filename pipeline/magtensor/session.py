@@ -140,7 +140,7 @@ def verification(calibrated: Survey, path: Path, planned: Plan) -> dict[str, Any
 def apply_to(calibration: Survey, path: Path, planned: Plan, *, tolerant: bool = False) -> Survey:
     """Another survey, loaded as the recipe loads and corrected with a calibration; `tolerant` as in `load_as`."""
     from magtensor.calibrated import corrected, require_sensors, restored
-    from magtensor.tensors import assembled, stored_assembly
+    from magtensor.tensors import assembled, stored_assembly, stored_refinement
 
     survey = load_as(planned, path, tolerant=tolerant)
     require_sensors(survey, result.sensors_of(calibration), str(path))
@@ -149,7 +149,9 @@ def apply_to(calibration: Survey, path: Path, planned: Plan, *, tolerant: bool =
     if "calibration/tensor_gain" in calibration:
         b, noise = survey.values("calibrated/b"), calibration.values("calibration/noise_std")
         position = calibration.values("calibration/position")
-        survey = survey.merged(assembled(stored_assembly(calibration), b, position, noise, fitted))
+        survey = survey.merged(
+            assembled(stored_assembly(calibration), b, position, noise, fitted, stored_refinement(calibration))
+        )
     return survey
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,10 +11,11 @@ import numpy as np
 from magtensor.calibration.types import Array, ArrayCalibration
 from magtensor.survey.model import AXES, Survey, Variable
 from magtensor.tensor.assembly import Assembly, unconstrained_assembly
-from magtensor.tensor.elements import closure
+from magtensor.tensor.elements import FIVE_OF_NINE, NINE_OF_FIVE, closure, five, full
 from magtensor.tensor.invariants import Invariants, invariants, invariants_std
 from magtensor.tensor.uncertainty import component_covariance, tensor_std
 
+FIVE = ("xx", "xy", "xz", "yy", "yz")
 TENSOR = ("time", "row", "column")
 INVARIANT_UNITS = Invariants("nT2/m2", "nT3/m3", "nT/m", "nT/m")  # type: ignore[arg-type]  # names, not arrays
 _CHUNK = 65536  # samples whose (5, 5) covariances are held at a time
@@ -57,7 +59,12 @@ def stored_assembly(calibration: Survey) -> Assembly:
 
 
 def assembled(
-    assembly: Assembly, b: Array, position: Array, noise: Array, calibration: ArrayCalibration
+    assembly: Assembly,
+    b: Array,
+    position: Array,
+    noise: Array,
+    calibration: ArrayCalibration,
+    refinement: tuple[Array, Array, Array] | None = None,
 ) -> dict[str, Variable]:
     """Tensor, mean field, invariants and their standard deviations at every sample.
 
@@ -67,17 +74,27 @@ def assembled(
         position: (S, 3) m.
         noise: (S, 3) nT white noise of b; NaN where unknown, and the deviations then hold the calibration's part alone.
         calibration: with its covariance.
+        refinement: H (5, 5), D (5,) nT/m of Sui 2017 eq. 9 and their covariance (30, 30), where there is one.
     """
     symmetric = assembly.symmetrised()
     tensor = symmetric.apply(b)
     covariance = np.diag(noise.ravel() ** 2) if np.isfinite(noise).all() else None
+    measured = five(tensor)
+    if refinement is not None:
+        symmetric = replace(symmetric, gain=_refined_gain(refinement[0], symmetric.gain))
+        tensor = symmetric.apply(b) + full(refinement[1])
     std = tensor_std(symmetric, b, noise_covariance=covariance, calibration=calibration)
     values = np.stack(invariants(tensor), axis=1)
     deviations = np.empty_like(values)
     for start in range(0, len(b), _CHUNK):
         part = slice(start, start + _CHUNK)
-        five = component_covariance(symmetric, b[part], noise_covariance=covariance, calibration=calibration)
-        deviations[part] = np.stack(invariants_std(tensor[part], five), axis=1)
+        each = component_covariance(symmetric, b[part], noise_covariance=covariance, calibration=calibration)
+        if refinement is not None:
+            own = _refinement_covariance(measured[part], refinement[2])
+            each += own
+            nine = np.einsum("ka,nab,kb->nk", NINE_OF_FIVE, own, NINE_OF_FIVE).reshape(-1, 3, 3)
+            std[part] = np.sqrt(std[part] ** 2 + nine)
+        deviations[part] = np.stack(invariants_std(tensor[part], each), axis=1)
     mean_field = assembly.field(b)
     return (
         tensor_variables(tensor, std)
@@ -85,6 +102,44 @@ def assembled(
         | closure_variables(b, position)
         | {"calibrated/mean_field": (("time", "axis"), mean_field, {"units": "nT", "long_name": "at the centre"})}
     )
+
+
+def _refined_gain(matrix: Array, gain: Array) -> Array:
+    out: Array = (NINE_OF_FIVE @ matrix @ FIVE_OF_NINE @ gain.reshape(9, -1)).reshape(gain.shape)
+    return out
+
+
+def _refinement_covariance(measured: Array, covariance: Array) -> Array:
+    """(N, 5, 5) of H T5 + D from the covariance of H (row by row) and D."""
+    forms = np.zeros((5, 6, 5, 6))
+    forms[:, :5, :, :5] = covariance[:25, :25].reshape(5, 5, 5, 5)
+    forms[:, :5, :, 5] = covariance[:25, 25:].reshape(5, 5, 5)
+    forms[:, 5, :, :5] = covariance[25:, :25].reshape(5, 5, 5)
+    forms[:, 5, :, 5] = covariance[25:, 25:]
+    z = np.column_stack([measured, np.ones(len(measured))])
+    out: Array = np.einsum("ni,aibj,nj->nab", z, forms, z, optimize=True)
+    return out
+
+
+def refinement_variables(matrix: Array, offset: Array, covariance: Array, facts: dict[str, Any]) -> dict[str, Variable]:
+    """A refinement as variables of the group `calibration`."""
+    names = [f"H_{r}_{c}" for r in FIVE for c in FIVE] + [f"D_{r}" for r in FIVE]
+    return {
+        "calibration/component": (("component",), np.array(FIVE), {}),
+        "calibration/coefficient": (("coefficient",), np.array(names), {}),
+        "calibration/tensor_matrix": (("component", "component_"), matrix, {"units": "1"} | facts),
+        "calibration/tensor_offset": (("component",), offset, {"units": "nT/m"}),
+        "calibration/tensor_covariance": (("coefficient", "coefficient_"), covariance, {}),
+    }
+
+
+def stored_refinement(calibration: Survey) -> tuple[Array, Array, Array] | None:
+    """What `refinement_variables` stored, if there is one."""
+    if "calibration/tensor_matrix" not in calibration:
+        return None
+    names = ("tensor_matrix", "tensor_offset", "tensor_covariance")
+    matrix, offset, covariance = (np.asarray(calibration.values(f"calibration/{n}")) for n in names)
+    return matrix, offset, covariance
 
 
 def closure_variables(b: Array, position: Array) -> dict[str, Variable]:

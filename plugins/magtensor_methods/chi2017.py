@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Annotated, Literal
 
+from pydantic import Field
+
 from magtensor import method
 from magtensor.calibration.coverage import WORST_ERROR
 from magtensor.calibration.types import Array, ArrayCalibration, SensorCalibration
-from pydantic import Field
-
 from magtensor_methods.scalar_options import WorstError
 
 
@@ -19,10 +19,10 @@ def chi2017(
     total_field: Array,
     *,
     fit: Annotated[
-        Literal["ellipsoid", "unit_norm"],
+        Literal["ellipsoid", "gradient"],
         Field(
-            description="constraint of the algebraic least squares: the ellipsoid restriction, "
-            "or ten coefficients of unit norm"
+            description="constraint of the algebraic least squares: the ellipsoid restriction of the paper, or a "
+            "unit mean squared gradient, which has less bias where the attitudes cover little"
         ),
     ] = "ellipsoid",
     worst_error: WorstError = WORST_ERROR,
@@ -41,10 +41,10 @@ def chi2017(
     NotEnoughData: the attitudes do not determine the ellipsoid; the message says which are missing.
     """
     from magtensor.calibration.factors import CHOLESKY
-    from magtensor.calibration.quadric import ellipsoid_restricted, null_vector
+    from magtensor.calibration.quadric import ellipsoid_restricted, gradient_normalised
     from magtensor.calibration.scalar import calibrate
 
-    fits = {"ellipsoid": ellipsoid_restricted, "unit_norm": null_vector}
+    fits = {"ellipsoid": ellipsoid_restricted, "gradient": gradient_normalised}
     return calibrate(raw, total_field, fits[fit], CHOLESKY, worst_error)
 
 

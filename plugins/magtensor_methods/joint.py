@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import Annotated
 
+from pydantic import Field
+
 from magtensor import method
 from magtensor.calibration.coverage import WORST_ERROR
 from magtensor.calibration.types import Array, ArrayCalibration
-from pydantic import Field
-
 from magtensor_methods.scalar_options import WorstError
 
 

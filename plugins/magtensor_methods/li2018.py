@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+
 from magtensor import method
 from magtensor.calibration.coverage import WORST_ERROR
 from magtensor.calibration.types import Array, ArrayCalibration, SensorCalibration
-
 from magtensor_methods.scalar_options import WorstError
 
 
@@ -59,7 +59,7 @@ def li2018_linear(raw: Array, total_field: Array, *, worst_error: WorstError = W
     from magtensor.calibration.factors import CHOLESKY
     from magtensor.calibration.parameters import LI, response
     from magtensor.calibration.quadric import constant_term_normalised
-    from magtensor.calibration.scalar import checked_samples, corrected, fit_or_refuse
+    from magtensor.calibration.scalar import checked_samples, corrected, fit_or_refuse, judged
 
     raw, total_field = checked_samples(raw, total_field)
     ellipsoid = fit_or_refuse(raw, total_field, constant_term_normalised)
@@ -71,7 +71,8 @@ def li2018_linear(raw: Array, total_field: Array, *, worst_error: WorstError = W
     nine[6:] *= unit
     c, offset = response(np.concatenate([nine, np.zeros(3)]), LI)
     matrix: Array = np.asarray(np.linalg.inv(c), dtype=np.float64)
-    return corrected(raw, total_field, matrix, offset, CHOLESKY, worst_error)
+    seen = judged(raw, total_field, matrix, offset, worst_error)
+    return corrected(raw, total_field, matrix, offset, CHOLESKY, seen)
 
 
 @method("calibrate_array", source="Li et al. 2018, sections 3.2 and 3.3, eqs. 2, 7-21")

@@ -11,7 +11,7 @@ WorstError = Annotated[
     Field(
         gt=0,
         le=1,
-        description="largest predicted standard deviation of |b| accepted, in the worst direction of the whole "
+        description="largest predicted error of |b| accepted, in the worst direction of the whole "
         "sphere, as a fraction of the total field; beyond it the attitudes are refused as not enough",
     ),
 ]

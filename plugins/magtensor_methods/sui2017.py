@@ -10,6 +10,9 @@ from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
 from magtensor import DataError, UsageError, method
 from magtensor.tensor.elements import METRIC, five, full, rotation_of_five
 from magtensor.tensor.excitation import (
@@ -39,8 +42,6 @@ from magtensor.tensor.refinement import (
     normalised_determinant,
     similarity,
 )
-from numpy.typing import NDArray
-from pydantic import Field
 
 Array = NDArray[np.float64]
 

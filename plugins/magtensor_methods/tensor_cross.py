@@ -5,11 +5,12 @@ from __future__ import annotations
 from typing import Annotated
 
 import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
 from magtensor import DataError, method
 from magtensor.tensor.assembly import NOT_SYMMETRISED, Assembly, assembly_from_gain
 from magtensor.tensor.geometry import array_centre, checked_positions, standard_geometry
-from numpy.typing import NDArray
-from pydantic import Field
 
 Array = NDArray[np.float64]
 

@@ -5,11 +5,12 @@ from __future__ import annotations
 from typing import Annotated
 
 import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
 from magtensor import method
 from magtensor.tensor.assembly import Assembly, least_squares_assembly
 from magtensor.tensor.geometry import Order
-from numpy.typing import NDArray
-from pydantic import Field
 
 
 @method("assemble_tensor", source="symmetric traceless tensor by weighted least squares on solid harmonics")

@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from magtensor import method
 from magtensor.calibration.coverage import WORST_ERROR
 from magtensor.calibration.types import Array, ArrayCalibration, SensorCalibration
-
 from magtensor_methods.scalar_options import WorstError
 
 

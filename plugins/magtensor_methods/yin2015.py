@@ -5,7 +5,6 @@ from __future__ import annotations
 from magtensor import method
 from magtensor.calibration.coverage import WORST_ERROR
 from magtensor.calibration.types import Array, SensorCalibration
-
 from magtensor_methods.scalar_options import WorstError
 
 

@@ -13,10 +13,10 @@ Scale errors, angles and offsets all count as small. It returns Li's printed 100
 from __future__ import annotations
 
 import numpy as np
+
 from magtensor import DataError, method
 from magtensor.calibration.coverage import WORST_ERROR
 from magtensor.calibration.types import Array, SensorCalibration
-
 from magtensor_methods.scalar_options import WorstError
 
 
@@ -36,13 +36,14 @@ def zhang2015(raw: Array, total_field: Array, *, worst_error: WorstError = WORST
     NotEnoughData: the attitudes do not determine the nine unknowns; the message says which are missing.
     DataError: errors so large that the model breaks down.
     """
-    from magtensor.calibration.coverage import coverage, require_coverage
-    from magtensor.calibration.factors import CHOLESKY
-    from magtensor.calibration.quadric import design
-    from magtensor.calibration.scalar import checked_samples, corrected
+    from magtensor.calibration.factors import CHOLESKY, upper
+    from magtensor.calibration.quadric import design, gradient_normalised
+    from magtensor.calibration.scalar import checked_samples, corrected, fit_or_refuse, judged
 
     raw, total_field = checked_samples(raw, total_field)
-    require_coverage(coverage(raw, total_field))
+    # the attitudes are judged by an exact fit: what this model neglects is no fault of theirs
+    exact = fit_or_refuse(raw, total_field, gradient_normalised)
+    seen = judged(raw, total_field, upper(exact.shape), exact.offset, worst_error)
     unit = float(np.mean(total_field))
     x = raw / unit
     left = np.sum(x**2, axis=1) - (total_field / unit) ** 2
@@ -55,4 +56,4 @@ def zhang2015(raw: Array, total_field: Array, *, worst_error: WorstError = WORST
             "the small-error model gives a negative scale factor",
             hint="its errors must be small against one: use chi2017",
         )
-    return corrected(raw, total_field, matrix, e[6:] * unit, CHOLESKY, worst_error)
+    return corrected(raw, total_field, matrix, e[6:] * unit, CHOLESKY, seen)

@@ -5,12 +5,12 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
+from pydantic import Field
+
 from magtensor import DataError, MethodChoice, stage
 from magtensor.calibrated import restored
 from magtensor.calibration.types import PARAMETERS_PER_SENSOR, SensorCalibration
 from magtensor.errors import did_you_mean
-from pydantic import Field
-
 from magtensor_stages.sensors import common_frame
 
 if TYPE_CHECKING:

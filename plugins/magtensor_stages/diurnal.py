@@ -74,7 +74,13 @@ def detrend_diurnal(
     if constant:
         found = reference.Sampled(np.full(len(at), values[0]), np.ones(len(at), bool), np.ones(len(at)))
     else:
-        gap = max_gap_s if max_gap_s is not None else USUAL_GAP * float(np.median(np.diff(time))) if len(time) > 1 else 1.0
+        gap = (
+            max_gap_s
+            if max_gap_s is not None
+            else USUAL_GAP * float(np.median(np.diff(time)))
+            if len(time) > 1
+            else 1.0
+        )
         found = reference.sample(at, time, values, smooth=interpolation == "pchip", max_gap_s=gap)
         if not found.covered.all():
             _refuse_or_tell(at, found.covered, time, gap, uncovered, where)
@@ -103,7 +109,9 @@ def detrend_diurnal(
 
 def _refuse_or_tell(at: Any, covered: Any, time: Any, gap: float, uncovered: str, where: str) -> None:
     """Refuse a survey that the reference does not cover, unless only a part of it is to be masked."""
-    span = f"the reference lasts from t = {time[0]:.3f} to {time[-1]:.3f} s, the survey from {at[0]:.3f} to {at[-1]:.3f} s"
+    span = (
+        f"the reference lasts from t = {time[0]:.3f} to {time[-1]:.3f} s, the survey from {at[0]:.3f} to {at[-1]:.3f} s"
+    )
     if not covered.any():
         raise DataError(
             f"the reference covers no sample of the survey: {span}",

@@ -28,9 +28,7 @@ BY = "load"
 def load(
     survey: Survey,
     *,
-    sensors: Annotated[
-        tuple[str, ...] | None, Field(description="use only these sensors; default: all")
-    ] = None,
+    sensors: Annotated[tuple[str, ...] | None, Field(description="use only these sensors; default: all")] = None,
     window_s: Annotated[
         tuple[float, float] | None, Field(description="use only this span, s after the first sample")
     ] = None,
@@ -84,7 +82,9 @@ def load(
             )
     attributes = {**found.attributes, **({"notes": notes} if notes else {})}
     loaded = replace(found, attributes=attributes, source=survey.source)
-    return loaded.merged({**_described(loaded), "good": (("time", "sensor"), good, {"long_name": "may be used"})}, flags)
+    return loaded.merged(
+        {**_described(loaded), "good": (("time", "sensor"), good, {"long_name": "may be used"})}, flags
+    )
 
 
 def _clock(seconds: float) -> str:
@@ -235,9 +235,7 @@ def _refuse_magnitude(survey: Survey, where: str) -> None:
             raise DataError(suspicion, where=f"{where}: reference/total_field", hint=f"are its units right? {accept}")
 
 
-def _flagged(
-    survey: Survey, saturation_nT: float | None, where: str
-) -> tuple[NDArray[np.bool_], list[Flag]]:
+def _flagged(survey: Survey, saturation_nT: float | None, where: str) -> tuple[NDArray[np.bool_], list[Flag]]:
     """(N, S) usable samples, and the flags that say why the others are not."""
     field, time = survey.values("b_raw"), survey.time
     good = survey.good_by_sensor.copy()

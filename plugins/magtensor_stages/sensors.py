@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
 from magtensor import DataError, MethodChoice, NotEnoughData, stage
 from magtensor.calibrated import contrasts, corrected, stored
 from magtensor.calibration.types import PARAMETERS_PER_SENSOR, ArrayCalibration, SensorCalibration
