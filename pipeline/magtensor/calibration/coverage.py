@@ -12,9 +12,13 @@ Two questions are asked, because either alone can be fooled.
    probability w^(n-1) (the sphericity test in two dimensions). The factor required is the one that this null
    exceeds once in a thousand, and never below ten: at ten, noise makes up 1 % of the information in the weakest
    direction, and the attenuation it causes stays as small.
-2. Are the predicted errors tolerable? The standard deviation of |b| that the covariance of the fit predicts, in
-   the worst direction of the whole sphere, must stay below a stated fraction of F. This catches what is unique
-   but weak: few samples, small tilts.
+2. Are the predicted errors tolerable? The error of |b| in the worst direction of the whole sphere must stay
+   below a stated fraction of F. It has two parts. The scatter follows from the covariance of the fit, at the
+   95 % upper bound of the noise that the residual of N - 9 degrees of freedom allows. The bias is what an
+   algebraic fit makes of noise in its regressors, the larger the less the attitudes determine; to first order in
+   the noise all algebraic fits scatter alike and differ by their bias alone, so the difference from the nearest
+   quadric (which has none in that order) shows it. This catches what is unique but weak: few samples, small
+   tilts, and a fit that has turned noise into a scale factor and then finds its own attitudes perfect.
 
 With many samples noise alone would pass the second question; with ten samples it may pass the first.
 """
@@ -28,14 +32,14 @@ import numpy as np
 from magtensor.errors import NotEnoughData
 
 from .covariance import scalar_noise
-from .quadric import design
+from .quadric import NotAnEllipsoid, ellipsoid_of, nearest_quadrics
 from .types import Array
 
 LEAST_SAMPLES = 10  # nine parameters and one sample to judge them by
 FALSE_ALARM = 1e-3  # probability that noise alone passes for a second, distinct quadric
 LEAST_RATIO = 10.0
 RESOLUTION = 1e-6  # of F: below this no sensor follows a quadric, so a smaller distance is no evidence
-WORST_ERROR = 0.02  # of F
+WORST_ERROR = 0.05  # of F
 UNSEEN = 45.0  # deg: a half axis with no sample nearer counts as never seen
 SAME_ATTITUDE = 1e-3  # of F
 
@@ -62,8 +66,8 @@ class Coverage:
         distance: nT, root-mean-square distance of the samples to the quadric nearest to them.
         second_distance: nT, the same for the next quadric; the larger, the better the coverage.
         required_distance: nT, what `second_distance` has to exceed.
-        worst_error: nT, predicted standard deviation of |b| in the worst direction of the sphere; infinite
-            where the fit leaves nothing to predict it from, NaN where no fit was given.
+        worst_error: nT, predicted error of |b| in the worst direction of the sphere; infinite where it cannot be
+            predicted, NaN where no fit was given.
         accepted_error: nT, what `worst_error` may reach.
         empty_cones: the largest cones of directions without a sample, largest first.
         unseen: half axes ("+x" ... "-z") that the field never came near.
@@ -98,7 +102,7 @@ class Coverage:
             )
         elif self.worst_error > self.accepted_error:
             found.append(
-                f"the predicted standard deviation of |b| reaches {self.worst_error:.3g} nT "
+                f"the predicted error of |b| reaches {self.worst_error:.3g} nT "
                 f"in some direction ({self.accepted_error:.3g} nT is accepted)"
             )
         return tuple(found)
@@ -136,12 +140,13 @@ def coverage(
     raw: (N, 3) nT, finite.
     total_field: (N,) nT, positive.
     matrix, offset: the fitted correction b = matrix @ (m - offset); without them only the quadrics are judged.
-    worst_error: accepted standard deviation of |b| in the worst direction, as a fraction of F.
+    worst_error: accepted error of |b| in the worst direction, as a fraction of F.
     """
     field = float(np.mean(total_field))
     centre = np.zeros(3) if offset is None else offset
     points = (centre + (raw - centre) * (field / total_field)[:, None]) / field
-    first, second = _quadric_distances(points)
+    nearest = nearest_quadrics(points)
+    first, second = (float(d) for d in nearest.distance[:2])
     noise = max(first * np.sqrt(len(raw) / max(len(raw) - 9, 1)), RESOLUTION)
     directions = _directions(points, centre / field)
     worst = float("nan")
@@ -150,7 +155,8 @@ def coverage(
         b = (raw - centre) @ matrix.T
         attitude = _attitude_design(b / np.linalg.norm(b, axis=1, keepdims=True))
         condition = _condition(attitude)
-        worst = _worst_error(attitude, matrix, centre, raw, total_field)
+        scatter = _scatter(attitude, matrix, centre, raw, total_field)
+        worst = float(np.hypot(scatter, _bias(matrix, centre / field, nearest.coefficients) * field))
     cones = _empty_cones(directions)
     return Coverage(
         samples=len(raw),
@@ -184,47 +190,6 @@ def require_coverage(found: Coverage) -> None:
     )
 
 
-def _quadric_distances(points: Array) -> tuple[float, float]:
-    """The two smallest Taubin distances of points (N, 3), in their unit; chunked, so N may be large."""
-    from scipy.linalg import eigh
-
-    centre = points.mean(axis=0)
-    spread = float(np.sqrt(np.mean((points - centre) ** 2)))
-    if spread == 0.0:
-        return 0.0, 0.0
-    x_all = (points - centre) / spread
-    gradients, grams, sums = np.zeros((9, 9)), np.zeros((9, 9)), np.zeros(9)
-    for start in range(0, len(x_all), 65536):
-        x = x_all[start : start + 65536]
-        rows = design(x)[:, :9]
-        sums += rows.sum(axis=0)
-        grams += rows.T @ rows
-        for k in range(3):
-            g = _design_derivative(x, k)
-            gradients += g.T @ g
-    n = len(points)
-    # the constant term is free: its best value is the mean
-    gram = grams / n - np.outer(sums, sums) / n**2
-    # a quadric whose gradient vanishes on all samples (a double plane) would be zero over zero
-    floor = 1e-13 * np.trace(gradients) / n * np.eye(9)
-    values = eigh(gram, gradients / n + floor, eigvals_only=True)
-    first, second = np.sqrt(np.maximum(values[:2], 0.0)) * spread
-    return float(first), float(second)
-
-
-def _design_derivative(x: Array, axis: int) -> Array:
-    """Derivative (N, 9) of `quadric.design` without its constant column, along one coordinate."""
-    out = np.zeros((len(x), 9))
-    out[:, axis] = 2 * x[:, axis]
-    for column, (i, j) in ((3, (1, 2)), (4, (0, 2)), (5, (0, 1))):
-        if axis == i:
-            out[:, column] = 2 * x[:, j]
-        elif axis == j:
-            out[:, column] = 2 * x[:, i]
-    out[:, 6 + axis] = 2.0
-    return out
-
-
 def _required_ratio(samples: int) -> float:
     """How much farther the second quadric must lie than the first (question 1 of the module)."""
     freedom = samples - 8
@@ -245,19 +210,31 @@ def _condition(attitude: Array) -> float:
     return float(np.sqrt(values[-1] / values[0])) if values[0] > 0 else float("inf")
 
 
-def _worst_error(attitude: Array, matrix: Array, offset: Array, raw: Array, total_field: Array) -> float:
+def _scatter(attitude: Array, matrix: Array, offset: Array, raw: Array, total_field: Array) -> float:
     """Predicted standard deviation of |b|, nT, in the worst direction of the sphere."""
+    from scipy.special import chdtri
+
     noise = scalar_noise(matrix, offset, raw, total_field)
-    if not np.isfinite(noise):
+    values, vectors = np.linalg.eigh(attitude.T @ attitude)
+    if not np.isfinite(noise) or values[0] <= values[-1] * 1e-15:
         return float("inf")
-    normal = attitude.T @ attitude
-    values, vectors = np.linalg.eigh(normal)
-    if values[0] <= values[-1] * 1e-15:
-        return float("inf")
+    freedom = len(raw) - 9
+    bound = noise * np.sqrt(freedom / chdtri(freedom, 0.95))
     b = (raw - offset) @ matrix.T
     gain = np.mean(np.sum(((b / np.linalg.norm(b, axis=1, keepdims=True)) @ matrix) ** 2, axis=1))
     sphere = _attitude_design(_sphere()) @ vectors
-    return float(noise * np.sqrt(gain * np.max(np.sum(sphere**2 / values, axis=1))))
+    return float(bound * np.sqrt(gain * np.max(np.sum(sphere**2 / values, axis=1))))
+
+
+def _bias(matrix: Array, offset: Array, nearest: Array) -> float:
+    """Largest difference of |b|/F over the sphere between a fit and the nearest quadric's ellipsoid."""
+    try:
+        other = ellipsoid_of(nearest)
+    except NotAnEllipsoid:
+        return float("inf")
+    points = np.linalg.solve(matrix, _sphere().T).T + offset - other.offset
+    squared = np.einsum("ni,ij,nj->n", points, other.shape, points)
+    return float(np.max(np.abs(np.sqrt(squared) - 1.0)))
 
 
 def _directions(points: Array, centre: Array) -> Array:

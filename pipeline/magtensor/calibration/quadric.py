@@ -66,10 +66,71 @@ def ellipsoid_of(p: Array) -> Ellipsoid:
     return Ellipsoid(shape, offset)
 
 
-def null_vector(x: Array) -> Array:
-    """Coefficients (10,) of unit norm with the least algebraic distance to points x (N, 3)."""
-    out: Array = np.linalg.svd(design(x), full_matrices=False)[2][-1]
+def design_derivative(x: Array, axis: int) -> Array:
+    """Derivative (N, 10) of `design` along one coordinate of the points x (N, 3)."""
+    out = np.zeros((len(x), 10))
+    out[:, axis] = 2 * x[:, axis]
+    for column, (i, j) in ((3, (1, 2)), (4, (0, 2)), (5, (0, 1))):
+        if axis == i:
+            out[:, column] = 2 * x[:, j]
+        elif axis == j:
+            out[:, column] = 2 * x[:, i]
+    out[:, 6 + axis] = 2.0
     return out
+
+
+@dataclass(frozen=True)
+class NearestQuadrics:
+    """The quadrics that points lie nearest to, by Taubin's distance: algebraic over gradient, both squared means.
+
+    Attributes:
+        distance: (9,) root-mean-square distance of the points to each, ascending, in the points' unit. Noise of
+            standard deviation s about a quadric puts its distance at s.
+        coefficients: (10,) of the nearest.
+    """
+
+    distance: Array
+    coefficients: Array
+
+
+def nearest_quadrics(x: Array) -> NearestQuadrics:
+    """Quadrics through points x (N, 3), in order of Taubin's distance. The points are read in chunks."""
+    from scipy.linalg import eigh
+
+    centre = x.mean(axis=0)
+    spread = float(np.sqrt(np.mean((x - centre) ** 2)))
+    if spread == 0.0:
+        return NearestQuadrics(np.zeros(9), np.full(10, np.nan))
+    gradients, gram, total = np.zeros((9, 9)), np.zeros((9, 9)), np.zeros(9)
+    for start in range(0, len(x), 65536):
+        part = (x[start : start + 65536] - centre) / spread
+        rows = design(part)[:, :9]
+        total += rows.sum(axis=0)
+        gram += rows.T @ rows
+        for axis in range(3):
+            g = design_derivative(part, axis)[:, :9]
+            gradients += g.T @ g
+    mean = total / len(x)
+    # the constant term is free: its best value takes the mean away
+    centred = gram / len(x) - np.outer(mean, mean)
+    # a quadric whose gradient vanishes on all samples (a double plane) would be zero over zero
+    floor = 1e-13 * np.trace(gradients) / len(x) * np.eye(9)
+    values, vectors = eigh(centred, gradients / len(x) + floor)
+    v = vectors[:, 0]
+    a, linear = shape_matrix(v) / spread**2, v[6:9] / spread
+    shifted = linear - a @ centre
+    constant = -mean @ v - 2 * linear @ centre + centre @ a @ centre
+    coefficients = np.array([*np.diag(a), a[1, 2], a[0, 2], a[0, 1], *shifted, constant])
+    return NearestQuadrics(np.sqrt(np.maximum(values, 0.0)) * spread, coefficients)
+
+
+def gradient_normalised(x: Array) -> Array:
+    """Coefficients (10,) with the least Taubin distance to points x (N, 3).
+
+    The constraint, a unit mean squared gradient, has the form of the noise that the points bring into the normal
+    equations, so the two cancel and the fit has no bias in the first order of the noise variance.
+    """
+    return nearest_quadrics(x).coefficients
 
 
 def constant_term_normalised(x: Array) -> Array:
@@ -89,6 +150,9 @@ def ellipsoid_restricted(x: Array) -> Array:
     Chi names the restriction and does not print it. Used here is k J - I^2 = 1 with I = a + b + c and
     J = ab + bc + ca - f^2 - g^2 - h^2, which at k = 4 admits ellipsoids alone and at larger k more slender ones
     (Li and Griffiths 2004): from a large k downwards, the first whose solution is an ellipsoid.
+
+    A quadric that the attitudes hardly determine, of algebraic distance t, is mixed in with a share of about
+    (noise / t)^2, because it changes J: with small tilts the bias exceeds the scatter. See `gradient_normalised`.
 
     Raises
     ------

@@ -7,7 +7,7 @@ import numpy as np
 from magtensor.errors import DataError, NotEnoughData
 
 from .covariance import residual, scalar_influence, scalar_noise
-from .coverage import LEAST_SAMPLES, WORST_ERROR, coverage, require_coverage
+from .coverage import LEAST_SAMPLES, WORST_ERROR, Coverage, coverage, require_coverage
 from .factors import factor
 from .quadric import Ellipsoid, Fit, NotAnEllipsoid, fit_ellipsoid
 from .types import Array, SensorCalibration
@@ -73,13 +73,13 @@ def calibrate(
     """
     raw, total_field = checked_samples(raw, total_field)
     ellipsoid = fit_or_refuse(raw, total_field, fit)
-    return corrected(raw, total_field, factor(ellipsoid.shape, frame), ellipsoid.offset, frame, worst_error)
+    matrix = factor(ellipsoid.shape, frame)
+    seen = judged(raw, total_field, matrix, ellipsoid.offset, worst_error)
+    return corrected(raw, total_field, matrix, ellipsoid.offset, frame, seen)
 
 
-def corrected(
-    raw: Array, total_field: Array, matrix: Array, offset: Array, frame: str, worst_error: float
-) -> SensorCalibration:
-    """A fitted correction with its covariance and figures, once its attitudes have been found sufficient.
+def judged(raw: Array, total_field: Array, matrix: Array, offset: Array, worst_error: float) -> Coverage:
+    """The coverage of samples with their fit, once it has been found sufficient.
 
     Raises
     ------
@@ -87,6 +87,13 @@ def corrected(
     """
     seen = coverage(raw, total_field, matrix=matrix, offset=offset, worst_error=worst_error)
     require_coverage(seen)
+    return seen
+
+
+def corrected(
+    raw: Array, total_field: Array, matrix: Array, offset: Array, frame: str, seen: Coverage
+) -> SensorCalibration:
+    """A fitted correction with its covariance and the figures that go with it."""
     noise = scalar_noise(matrix, offset, raw, total_field)
     influence = scalar_influence(matrix, offset, raw, total_field, frame)
     r = residual(matrix, offset, raw, total_field)
