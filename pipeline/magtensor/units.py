@@ -30,7 +30,7 @@ _FLUX, _LENGTH, _TIME, _TEMPERATURE = "magnetic flux density", "length", "time",
 _CURRENT, _VOLTAGE, _ANGLE, _RATE = "electric current", "voltage", "angle", "angular rate"
 _ACCELERATION, _PRESSURE, _PURE, _COUNT, _FREQUENCY = "acceleration", "pressure", "pure number", "counts", "frequency"
 
-# Base units: nT, m, s, degC, A, V, rad, rad s-1, m s-2, Pa, 1, count, Hz, nT m-1. Spelling as the CF convention writes it.
+# Base units: nT, m, s, degC, A, V, rad, rad s-1, m s-2, Pa, 1, counts, Hz, nT m-1. Spelt as the CF convention does.
 UNITS: dict[str, Unit] = {
     "nT": Unit(_FLUX, 1.0),
     "pT": Unit(_FLUX, 1e-3),

@@ -58,8 +58,7 @@ def _table(path: Path, file: cdflib.CDF) -> Tables:
         attributes = {str(k): _plain(v) for k, v in file.varattsget(name).items()}
         origin = f"{path.name}: {name}"
         if kind in _EPOCHS:
-            seconds, units = _seconds(values, origin)
-            columns[name] = Column.of(name, origin, seconds, units)
+            columns[name] = Column.of(name, origin, *_seconds(values, origin))
             epochs.append(name)
             continue
         units = next((str(attributes[k]) for k in ("UNITS", "units", "Units") if k in attributes), None)

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from magtensor.components import reader
@@ -105,7 +104,7 @@ def _table(path: Path, name: str, lines: list[str], max_bad_share: float) -> Tab
 def _header(name: str, lines: list[str]) -> tuple[dict[str, Any], list[str], int]:
     """The header's entries, the components' column names, and where the rows begin."""
     attributes: dict[str, Any] = {}
-    comments = []
+    comments: list[str] = []
     for i, line in enumerate(lines):
         fields = line.replace("|", " ").split()
         if tuple(fields[:3]) == _LEADING:

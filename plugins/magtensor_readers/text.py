@@ -31,9 +31,7 @@ def text(
     delimiter: Annotated[
         Literal["auto", "comma", "semicolon", "tab", "blank"], Field(description="what separates the columns")
     ] = "auto",
-    header: Annotated[
-        bool | Literal["auto"], Field(description="whether the first line names the columns")
-    ] = "auto",
+    header: Annotated[bool | Literal["auto"], Field(description="whether the first line names the columns")] = "auto",
     comment: Annotated[str, Field(description="lines that start with this are left out")] = "#",
     skip_lines: Annotated[int, Field(ge=0, description="lines before the header or the first row")] = 0,
     decimal: Annotated[Literal[".", ","], Field(description="decimal mark")] = ".",
@@ -191,9 +189,7 @@ def _quoted(bad: dict[int, str]) -> str:
     return ", ".join(shown) + (f" and {len(bad) - _SHOWN} more" if len(bad) > _SHOWN else "")
 
 
-def _parsed(
-    lines: list[str], split: _Splitter, decimal: str, missing: Sequence[str], width: int
-) -> list[NDArray[Any]]:
+def _parsed(lines: list[str], split: _Splitter, decimal: str, missing: Sequence[str], width: int) -> list[NDArray[Any]]:
     """Columns as pandas' parser sees them: numbers, or text where something in the column is not a number."""
     import io
 

@@ -87,7 +87,7 @@ def detrend_diurnal(
     field = found.values
     if isinstance(base, str):
         covered = field[found.covered]
-        value = float({"mean": np.mean, "median": np.median, "first": lambda v: v[0]}[base](covered))
+        value = float({"mean": covered.mean(), "median": np.median(covered), "first": covered[0]}[base])
     else:
         value = float(base)
     facts = {"units": "nT", "origin": origin}
@@ -121,7 +121,7 @@ def _refuse_or_tell(at: Any, covered: Any, time: Any, gap: float, uncovered: str
     if uncovered == "refuse":
         first = float(at[~covered][0])
         raise DataError(
-            f"the reference does not cover {int((~covered).sum())} of {len(at)} samples, the first at t = {first:.3f} s",
+            f"the reference does not cover {int((~covered).sum())} of {len(at)} samples, first at t = {first:.3f} s",
             where=where,
             hint=f"{span}; steps over {gap:g} s are gaps (max_gap_s); `uncovered: mask` flags these samples instead",
         )

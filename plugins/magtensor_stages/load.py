@@ -242,13 +242,16 @@ def _flagged(survey: Survey, saturation_nT: float | None, where: str) -> tuple[N
     flags: list[Flag] = []
     for s, name in enumerate(survey.sensors):
         own = field[:, s]
-        missing, infinite = np.isnan(own).any(axis=1), np.isinf(own).any(axis=1)
+        missing, infinite = np.asarray(np.isnan(own).any(axis=1)), np.asarray(np.isinf(own).any(axis=1))
         rails = (np.abs(own) >= saturation_nT) if saturation_nT is not None else checks.saturated(own)
         others = np.delete(field, s, axis=1) if field.shape[1] > 1 else None
         for bad, reason in (
             (missing, "missing value"),
             (infinite, "infinite value"),
-            (rails.any(axis=1), f"saturated on axis {', '.join(AXES[a] for a in np.flatnonzero(rails.any(axis=0)))}"),
+            (
+                np.asarray(rails.any(axis=1)),
+                f"saturated on axis {', '.join(AXES[a] for a in np.flatnonzero(rails.any(axis=0)))}",
+            ),
             (checks.stuck(own, others), "stuck: the same numbers for longer than chance explains"),
         ):
             flags += flag_ranges(time, bad, by=BY, reason=reason, sensor=name)

@@ -160,9 +160,7 @@ def _numeric(values: NDArray[Any], column: Column) -> None:
         raise DataError(f"values of type {values.dtype} where numbers are needed", where=column.origin)
 
 
-def _dims(
-    name: str, column: Column, sizes: Mapping[str, int], notes: list[str]
-) -> tuple[str, ...] | None:
+def _dims(name: str, column: Column, sizes: Mapping[str, int], notes: list[str]) -> tuple[str, ...] | None:
     """The dimensions of a variable of the survey; None for an extra that fits none."""
     known = expected(name)
     choices = known[0] if known else (("time",), ("time", "sensor"), ("time", "axis"))
@@ -209,7 +207,9 @@ def _variable(name: str, column: Column, sizes: Mapping[str, int], notes: list[s
 
 def _converted(values: NDArray[Any], column: Column, units: str) -> NDArray[np.float64]:
     if column.units is None:
-        raise DataError(f"it has no units; {units} is expected", where=column.origin, hint=f"set its units attribute to {units}")
+        raise DataError(
+            f"it has no units; {units} is expected", where=column.origin, hint=f"set its units attribute to {units}"
+        )
     try:
         return convert(values, column.units, units)
     except UnitError as error:

@@ -259,7 +259,7 @@ def copies(field: Floats) -> list[tuple[int, int, int, int]]:
     Args:
         field: (N, S, 3) nT.
     """
-    count, sensors, _ = field.shape
+    count = len(field)
     flat = field.reshape(count, -1)
     probe = np.unique(np.linspace(0, count - 1, min(count, 1000)).astype(int))
     found = []

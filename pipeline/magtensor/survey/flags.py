@@ -55,7 +55,9 @@ def flag_ranges(
         a, b = starts[most], stops[-1]
         count = int(bad[a:].sum())
         flags.append(
-            Flag(float(time[a]), float(time[b - 1]), count, sensor, by, f"{reason} (and {len(starts) - most} more runs)")
+            Flag(
+                float(time[a]), float(time[b - 1]), count, sensor, by, f"{reason} (and {len(starts) - most} more runs)"
+            )
         )
     return flags
 

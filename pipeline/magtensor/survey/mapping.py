@@ -222,7 +222,11 @@ class _Mapper:
             raise DataError("no height can be had from it", where=f"{self.tables.where}: reference.altitude_model")
         base = float(convert(section.value, section.units, "nT"))
         about = f"{base:g} nT at {section.at_m:g} m, decreasing with height as a dipole's field"
-        return dipole_decrease(base, height, section.at_m), {"origin": "modelled", "comment": about, **_why(section.why)}
+        return dipole_decrease(base, height, section.at_m), {
+            "origin": "modelled",
+            "comment": about,
+            **_why(section.why),
+        }
 
 
 def mapped(source: Source) -> Survey:
@@ -324,7 +328,11 @@ def _continuous(quaternions: NDArray[np.float64]) -> NDArray[np.float64]:
 def euler_quaternion(
     roll: NDArray[np.float64], pitch: NDArray[np.float64], yaw: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Quaternions (N, 4), scalar last, platform to world, of the aerospace sequence yaw (z), pitch (y), roll (x), rad."""
+    """Quaternions (N, 4), scalar last, platform to world, of the aerospace sequence yaw (z), pitch (y), roll (x).
+
+    Args:
+        roll, pitch, yaw: (N,) rad.
+    """
     cr, sr, cp, sp, cy, sy = (f(a / 2) for a in (roll, pitch, yaw) for f in (np.cos, np.sin))
     return np.stack(
         [
@@ -335,5 +343,3 @@ def euler_quaternion(
         ],
         axis=1,
     )
-
-

@@ -92,7 +92,9 @@ class Survey:
 
     def paths(self) -> list[str]:
         """Every variable and coordinate, sorted."""
-        return sorted(short_path(n, str(v)) for n, node in self.tree.children.items() for v in node.to_dataset().variables)
+        return sorted(
+            short_path(n, str(v)) for n, node in self.tree.children.items() for v in node.to_dataset().variables
+        )
 
     def matching(self, pattern: str) -> list[str]:
         """The paths that match `current_*`, `calibration/*`, `*` (the array's own), ..."""

@@ -6,6 +6,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -56,7 +57,8 @@ class Rows:
         numbers = matrix(self.tables, ref)
         if len(numbers) != len(self.time):
             raise DataError(
-                f"{len(numbers)} rows, but the time base has {len(self.time)}", where=self.tables.find(_name(ref)).origin
+                f"{len(numbers)} rows, but the time base has {len(self.time)}",
+                where=self.tables.find(_name(ref)).origin,
             )
         return numbers if self.order is None else numbers[self.order]
 
@@ -101,7 +103,7 @@ def matrix(tables: Tables, ref: Ref) -> NDArray[Any]:
         first = int(part[2])
         last = int(part[3]) if part[3] else first + 1
         if values.ndim < 2 or not first < last <= values.shape[1]:
-            raise DataError(f"there is no part [{ref[len(part[1]) + 1:]} in shape {values.shape}", where=column.origin)
+            raise DataError(f"there is no part {ref} in shape {values.shape}", where=column.origin)
         values = values[:, first:last]
     return values.reshape(len(values), -1)
 
@@ -121,7 +123,7 @@ def rows_of(part: FileSection, tables: Tables) -> Rows:
                 where=tables.where,
                 hint="give `time` with a column (`from`) or a `rate_Hz`",
             )
-        section = TimeSection(from_="time")  # type: ignore[call-arg]
+        section = TimeSection(from_="time")
     time, epoch = _rate_times(section, tables) if section.rate_Hz is not None else _column_times(section, tables)
     relative = epoch is None
     epoch = epoch or parse_instant(UNIX)
@@ -215,7 +217,7 @@ def _order(time: NDArray[np.float64], part_rows: Sequence[int]) -> NDArray[np.in
     """Row numbers with the files in the order of their first times; inside a file nothing moves."""
     bounds = np.concatenate(([0], np.cumsum(part_rows)))
     starts = []
-    for a, b in zip(bounds[:-1], bounds[1:], strict=True):
+    for a, b in pairwise(bounds):
         known = time[a:b][np.isfinite(time[a:b])]
         starts.append(known[0] if known.size else np.inf)
     turn = np.argsort(starts, kind="stable")
@@ -256,18 +258,19 @@ def quantity(section: QuantitySection, rows: Rows, *, to: str | None, what: str)
     origin = f"{rows.tables.where}: {what}"
     if section.missing:
         raw[np.isin(raw, section.missing)] = np.nan
-    unbelievable = np.zeros(len(raw), dtype=bool)
+    unbelievable: NDArray[np.bool_] = np.zeros(len(raw), dtype=bool)
     if section.valid is not None:
         low, high = section.valid
-        unbelievable = ((raw < low) | (raw > high)).any(axis=1)
+        unbelievable = np.asarray(((raw < low) | (raw > high)).any(axis=1))
     if section.wrap is not None:
         raw = signed(raw, section.wrap)
     raw = raw * _each(section.scale, raw.shape[1], "scale", origin)
     raw = raw + _each(section.offset, raw.shape[1], "offset", origin)
     stated = rows.units(refs)
     units = section.units or stated
-    notes = ()
-    if section.units and stated and section.scale == 1.0 and section.offset == 0.0 and not _agree(section.units, stated):
+    notes: tuple[str, ...] = ()
+    untouched = section.scale == 1.0 and section.offset == 0.0
+    if section.units and stated and untouched and not _agree(section.units, stated):
         notes = (f"{what}: the file says {stated}, the recipe says {section.units}; the recipe holds",)
     if to is not None:
         if units is None:

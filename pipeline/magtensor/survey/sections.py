@@ -63,19 +63,25 @@ class TimeSection(Section):
     """Where the times are: a column, or a rate."""
 
     from_: Ref | list[Ref] | None = Field(
-        None, alias="from", description="column with the time; two or more text columns (date, clock) are joined by a space"
+        None,
+        alias="from",
+        description="column with the time; several text columns (date, clock) are joined by a space",
     )
     units: Annotated[str, BeforeValidator(lambda v: _time_unit(v) if isinstance(v, str) else v)] | None = Field(
-        None, description="unit of the numbers (s, ms, ...), or `seconds since <ISO 8601>`; default: what the file says, else s"
+        None,
+        description="unit of the numbers (s, ms, ...) or `seconds since <ISO 8601>`; default: the file's, else s",
     )
     epoch: Annotated[str, BeforeValidator(lambda v: _epoch(v) if isinstance(v, str) else v)] | None = Field(
         None, description="what the numbers count from: an ISO 8601 time, or `unix`; for a time of day, its first day"
     )
     format: str | None = Field(None, description="strptime pattern of clock text; default: ISO 8601")
     rate_Hz: Number | str | None = Field(
-        None, description="samples per second where there is no time column; or the name of the file attribute that states it"
+        None,
+        description="samples per second where there is no time column, or the file attribute that states it",
     )
-    counter: int | None = Field(None, gt=1, description="the number at which a time counter starts again from 0 (65536, ...)")
+    counter: int | None = Field(
+        None, gt=1, description="the number at which a time counter starts again from 0 (65536, ...)"
+    )
     shift_s: float = Field(0.0, description="added to the times, s (a clock known to be wrong)")
 
     @model_validator(mode="after")
@@ -123,15 +129,24 @@ class QuantitySection(FileSection):
     """
 
     from_: Ref | list[Ref] = Field(
-        alias="from", description="column name or number (from 0), dataset path, `dataset[1]` or `dataset[0:3]` for a part; or several"
+        alias="from",
+        description="column name or number (from 0), dataset path, a part of one (`mag[1]`, `mag[0:3]`); or several",
     )
     units: Units | None = Field(None, description="units after scale and offset; default: what the file says")
-    scale: Number | list[Number] = Field(1.0, description="units per count; one number or one per column; `1/75` is allowed")
-    offset: Number | list[Number] = Field(0.0, description="added after the scale, in `units`; one number or one per column")
+    scale: Number | list[Number] = Field(
+        1.0, description="units per count; one number or one per column; `1/75` is allowed"
+    )
+    offset: Number | list[Number] = Field(
+        0.0, description="added after the scale, in `units`; one number or one per column"
+    )
     missing: list[float] = Field(default_factory=list, description="numbers that stand for a missing value")
-    valid: tuple[Number, Number] | None = Field(None, description="range of believable numbers; others are taken as missing")
+    valid: tuple[Number, Number] | None = Field(
+        None, description="range of believable numbers; others are taken as missing"
+    )
     wrap: int | None = Field(
-        None, gt=1, description="a signed register read as unsigned: numbers from wrap/2 up are negative (4096 for 12 bits)"
+        None,
+        gt=1,
+        description="a signed register read as unsigned: numbers from wrap/2 up are negative (4096 for 12 bits)",
     )
     axes: tuple[Axis, Axis, Axis] | None = Field(
         None, description="for three columns: which of them, with which sign, is the platform's x, y, z ([y, x, -z])"
@@ -149,14 +164,14 @@ class QuantitySection(FileSection):
 class SensorSection(QuantitySection):
     """One three-axis sensor."""
 
-    units: Annotated[Units, _dimension_check("magnetic flux density")] | None = Field(  # type: ignore[assignment]
+    units: Annotated[Units, _dimension_check("magnetic flux density")] | None = Field(
         None, description="units after scale and offset (nT, uT, mG, ...); default: what the file says"
     )
     position: tuple[float, float, float] | None = Field(None, description="sensor centre in the platform frame, m")
 
 
 class ChannelSection(QuantitySection):
-    """A logged channel; `temperature`, `current_<name>`, `acceleration` and `angular_rate` are converted to the layout's units."""
+    """A logged channel; those whose names the canonical layout knows are converted to its units."""
 
     per: Literal["sensor", "axis"] | None = Field(
         None, description="what several columns are; default: axis for three, except for temperature"
@@ -164,7 +179,7 @@ class ChannelSection(QuantitySection):
 
 
 class EulerSection(Section):
-    """Attitude as roll, pitch, yaw (about x, then y, then z of the platform; aerospace sequence z-y-x from the world)."""
+    """Attitude as roll, pitch and yaw: the aerospace sequence, from the world about z, then y, then x."""
 
     roll: Ref = Field(description="column of roll")
     pitch: Ref = Field(description="column of pitch")
@@ -214,7 +229,9 @@ class AltitudeSection(Section):
     value: float = Field(gt=0, description="the total field F0 at the height h0")
     units: Annotated[Units, _dimension_check("magnetic flux density")] = Field(description="nT, uT, ...")
     at_m: float = Field(0.0, description="the height h0 above sea level, m")
-    pressure: QuantitySection | None = Field(None, description="air pressure, from which the standard atmosphere gives h (to 47 km)")
+    pressure: QuantitySection | None = Field(
+        None, description="air pressure, from which the standard atmosphere gives h (to 47 km)"
+    )
     height: QuantitySection | None = Field(None, description="the height above sea level itself")
     why: str = Field("", description="where F0 comes from; kept with the result")
 
@@ -231,8 +248,12 @@ REFERENCE_KINDS = ("total_field", "components", "constant", "altitude_model")
 class ReferenceSection(FileSection):
     """The total field to calibrate against; without a `file` its columns are in the survey's own files."""
 
-    total_field: QuantitySection | None = Field(None, description="column with the total field of a scalar magnetometer")
-    components: QuantitySection | None = Field(None, description="three columns of a vector instrument; their magnitude is the total field")
+    total_field: QuantitySection | None = Field(
+        None, description="column with the total field of a scalar magnetometer"
+    )
+    components: QuantitySection | None = Field(
+        None, description="three columns of a vector instrument; their magnitude is the total field"
+    )
     constant: ConstantSection | None = Field(None, description="a total field that does not change")
     altitude_model: AltitudeSection | None = Field(None, description="a total field modelled from the height")
     world_field: VectorSection | None = Field(
@@ -304,11 +325,27 @@ class SurveySection(FileSection):
                 raise ValueError(f"a channel cannot be called {' or '.join(taken)}")
         elif self.channels or self.attitude or self.segment or self.time:
             raise ValueError("a mapping needs `sensors`; without one the file must be in the canonical layout")
-        elif self.reference is not None and (self.reference.total_field or self.reference.components) and not self.reference.names:
+        elif (
+            self.reference is not None
+            and (self.reference.total_field or self.reference.components)
+            and not self.reference.names
+        ):
             raise ValueError("with a canonical survey the `reference` must name its own `file`, or be constant")
         elif self.reference is not None and self.reference.altitude_model is not None:
             raise ValueError("an `altitude_model` needs a mapping with `sensors`")
         return self
 
 
-RESERVED = ("time", "sensor", "axis", "quaternion", "b_raw", "position", "attitude", "segment", "good", "total_field", "diurnal")
+RESERVED = (
+    "time",
+    "sensor",
+    "axis",
+    "quaternion",
+    "b_raw",
+    "position",
+    "attitude",
+    "segment",
+    "good",
+    "total_field",
+    "diurnal",
+)

@@ -59,7 +59,10 @@ class Source:
             if component is None:
                 known = sorted({s for c in self.readers.values() for s in c.suffixes})
                 found.append(
-                    (f"{prefix}reader", f"no reader for {Path(part.names[0]).name}; name one (endings known: {', '.join(known)})")
+                    (
+                        f"{prefix}reader",
+                        f"no reader for {Path(part.names[0]).name}; name one (endings known: {', '.join(known)})",
+                    )
                 )
                 continue
             for error in _option_errors(component, part.options):
@@ -178,5 +181,3 @@ def _option_errors(component: Component, options: Mapping[str, Any]) -> list[tup
                 found.append((place, str(one["msg"])))
         return found
     return []
-
-

@@ -139,7 +139,9 @@ def _joined(pieces: Sequence[Column]) -> Column:
     first = pieces[0]
     for piece in pieces[1:]:
         if piece.shape[1:] != first.shape[1:]:
-            raise DataError(f"shape {piece.shape} does not continue {first.shape} of {first.origin}", where=piece.origin)
+            raise DataError(
+                f"shape {piece.shape} does not continue {first.shape} of {first.origin}", where=piece.origin
+            )
         if piece.units != first.units:
             raise DataError(f"units {piece.units} differ from {first.units} of {first.origin}", where=piece.origin)
     rows = sum(p.shape[0] for p in pieces if p.shape)

@@ -115,7 +115,9 @@ def texts_to_seconds(
             first = instant.replace(hour=0, minute=0, second=0, microsecond=0)
         instants[i] = (instant - first).total_seconds()
     if first is None or np.isnan(instants).all():
-        raise ValueError(f"none of the times ('{texts[0] if len(texts) else ''}', ...) reads as {pattern or 'ISO 8601'}")
+        raise ValueError(
+            f"none of the times ('{texts[0] if len(texts) else ''}', ...) reads as {pattern or 'ISO 8601'}"
+        )
     if daily:
         read = np.isfinite(instants)
         turns = np.concatenate(([0.0], np.cumsum(np.diff(instants[read]) < -43200.0)))
