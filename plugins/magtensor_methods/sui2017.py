@@ -46,7 +46,7 @@ from magtensor.tensor.refinement import (
 Array = NDArray[np.float64]
 
 WORST_MISFIT = 0.3  # of the 50 equations, relative; 0.05 is what noise makes of a barely sufficient series
-LEAST_SIMILARITY = 0.8  # of H to the prior; errors of 15 degrees and 20 % leave 0.9
+LEAST_SIMILARITY = 0.8  # of H to the prior; errors of 20 degrees and 30 % leave 0.93
 
 
 @method("refine_invariants", source="Sui et al. 2017, eqs. 9-19")
@@ -71,7 +71,8 @@ def sui2017(
 
     Parameters
     ----------
-    tensor : (N, 3, 3) nT/m, measured while the array rotated about its centre in one place near a source.
+    tensor : (N, 3, 3) nT/m, measured while the array rotated about its centre in one place near a source; of a
+        tensor that is not symmetric and traceless the part that is so is taken.
     invariant_1, invariant_2 : I1 = -1/2 sum G^2 in (nT/m)^2 and I2 = det G in (nT/m)^3 of the true tensor there.
 
     Raises

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from dipole import dipole_tensor, random_rotations
+
 from magtensor.tensor.elements import FIVE_OF_NINE, NINE_OF_FIVE, five
 
 MOMENT = np.array([250000.0, 250000.0, -353553.39])  # A m^2

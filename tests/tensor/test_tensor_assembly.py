@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 from dipole import dipole_field, dipole_tensor
+
 from magtensor import DataError, NotEnoughData
 from magtensor.calibration.types import ArrayCalibration
 from magtensor.components import component_of
@@ -136,6 +137,12 @@ def test_order_too_high_is_refused_with_what_remains():
         least_squares(standard_geometry("cube", 0.5), None, highest_order="third")
     assert str(refused.value).startswith("position: Gxx, Gyy cannot be determined beside the terms up to the third")
     assert "only Gxy, Gxz, Gyz can be" in str(refused.value) and "lower highest_order" in str(refused.value)
+
+
+def test_a_field_that_curvature_hides_is_noted():
+    assembly = least_squares(standard_geometry("cross", 0.5), None, highest_order="second")
+    assert any("linear field" in note for note in assembly.notes)
+    assert least_squares(standard_geometry("cube", 0.5), None, highest_order="second").notes == ()
 
 
 def test_duplicate_sensors_are_noted():

@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 from dipole import dipole_field, dipole_tensor
+
 from magtensor import DataError, UsageError
 from magtensor.tensor.elements import full
 from magtensor.tensor.geometry import (
