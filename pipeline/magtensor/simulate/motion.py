@@ -174,7 +174,7 @@ class Postures(_OnSite):
         turntable = _about("z", 2 * np.pi * np.arange(spec.turntable_steps) / max(spec.turntable_steps, 1))
         self.attitudes = np.concatenate([turntable, _random_tilts(rng, spec.random_count, spec.tilt_deg)])
         self.rest_s, self.period_s = spec.rest_s, spec.rest_s + spec.turn_s
-        self.duration_s = len(self.attitudes) * self.period_s - spec.turn_s
+        self.duration_s = spec.duration_s
         following = np.roll(self.attitudes, -1, axis=0)
         self.turns = logarithm(multiply(conjugate(self.attitudes), following))
 
@@ -233,7 +233,7 @@ class SurveyLines:
         self.spec = spec
         self.line_s = spec.length_m / spec.speed_m_s
         self.period_s = self.line_s + spec.turn_s
-        self.duration_s = spec.lines * self.period_s - spec.turn_s
+        self.duration_s = spec.duration_s
         span = (-MARGIN_S, self.duration_s + MARGIN_S)
         self.wobble = SmoothRandom(rng, span, spec.wobble_time_s, np.deg2rad(spec.wobble_deg), 3)
         azimuth = np.deg2rad(spec.azimuth_deg)

@@ -5,6 +5,7 @@ World frame: x east, y north, z up. Attitudes are quaternions, scalar last, plat
 
 from __future__ import annotations
 
+from math import ceil
 from typing import Annotated, Literal
 
 from pydantic import Field
@@ -54,6 +55,11 @@ class PosturesSpec(Spec):
     turn_s: float = Field(5.0, gt=0, description="time to turn to the next attitude, s; not recorded")
     average: bool = Field(False, description="true: one averaged sample for each attitude")
 
+    @property
+    def duration_s(self) -> float:
+        """Length of the survey, s."""
+        return (self.turntable_steps + self.random_count) * (self.rest_s + self.turn_s) - self.turn_s
+
 
 class EulerGridSpec(Spec):
     """One sample in each attitude of a full grid of three angles (Li 2018 section 4)."""
@@ -72,6 +78,11 @@ class EulerGridSpec(Spec):
     zero_frame: Literal["ENU", "NED"] = Field(
         "NED", description="world axes the platform axes lie along at zero angles"
     )
+
+    @property
+    def count(self) -> int:
+        """Number of attitudes."""
+        return ceil(360.0 / self.step_deg - 1e-9) ** 3
 
 
 class RandomAttitudesSpec(Spec):
@@ -135,6 +146,11 @@ class SurveyLinesSpec(Spec):
     )
     wobble_time_s: float = Field(2.0, gt=0, description="correlation time of that, s")
 
+    @property
+    def duration_s(self) -> float:
+        """Length of the survey, s."""
+        return self.lines * (self.length_m / self.speed_m_s + self.turn_s) - self.turn_s
+
 
 MotionSpec = Annotated[
     TumblingSpec
@@ -146,3 +162,10 @@ MotionSpec = Annotated[
     | SurveyLinesSpec,
     Field(discriminator="type"),
 ]
+
+
+def length_s(spec: MotionSpec, rate_Hz: float) -> float:
+    """Length of the survey, s."""
+    if isinstance(spec, EulerGridSpec | RandomAttitudesSpec):
+        return spec.count / rate_Hz
+    return spec.duration_s

@@ -11,6 +11,7 @@ is the sensor's offset.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Annotated, Literal
 
 import numpy as np
@@ -76,12 +77,13 @@ def flicker(rng: np.random.Generator, samples: int, rate_Hz: float, at_1Hz: floa
 
 def sensor_noise(
     spec: NoiseSpec, rng: np.random.Generator, samples: int, rate_Hz: float, sensors: int
-) -> Array:
-    """(samples, S, 3) nT of noise on an even time base."""
+) -> Iterator[Array]:
+    """(samples, 3) nT of noise on an even time base, for one sensor after the other."""
     white = level(spec.white_sd_nT, sensors, "white_sd_nT")
     pink = level(spec.flicker_nT_per_rtHz, sensors, "flicker_nT_per_rtHz")
-    out = rng.standard_normal((samples, sensors, 3))
-    out *= white
-    for s, axis in np.argwhere(pink > 0):
-        out[:, s, axis] += flicker(rng, samples, rate_Hz, float(pink[s, axis]), spec.flicker_exponent)
-    return out
+    for s in range(sensors):
+        out = rng.standard_normal((samples, 3)) * white[s]
+        for axis in range(3):
+            if pink[s, axis] > 0:
+                out[:, axis] += flicker(rng, samples, rate_Hz, float(pink[s, axis]), spec.flicker_exponent)
+        yield out

@@ -95,7 +95,7 @@ def _parabola_response(tau: Array, step: float) -> tuple[Array, Array]:
     With z = step / tau the response is z times the integral of exp(-z (1 - s)) u(s) over s in (0, 1); the moments
     M_k of that kernel follow from M_(k+1) = 1 - (k + 1) M_k / z, or for small z, where that cancels, from the series.
     """
-    z = step / np.where(tau > 0, tau, step / 745.0)
+    z = step / np.where(tau > 0, tau, step * 1e-30)  # 0: so short that only the end of the step counts
     small = np.minimum(z, 1.0)
     series = [np.zeros_like(z) for _ in range(3)]
     for k in range(3):

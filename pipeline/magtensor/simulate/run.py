@@ -8,7 +8,6 @@ samples.
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -30,11 +29,14 @@ from magtensor.simulate.motion import (
     build_motion,
     specific_force,
 )
+from magtensor.simulate.motion_spec import length_s
 from magtensor.simulate.noise import level, sensor_noise
-from magtensor.simulate.rotations import exponential, multiply
+from magtensor.simulate.rotations import exponential, multiply, transform
 from magtensor.simulate.scenario import LoggingSpec, Scenario, read_scenario
 from magtensor.simulate.sources import Dipole
 from magtensor.simulate.spec import Array, stream
+
+MAX_SAMPLES = 50_000_000  # some 25 GB of memory with four sensors
 
 
 @dataclass(frozen=True)
@@ -87,7 +89,7 @@ class Simulated:
 
 
 def simulate(
-    scenario: Scenario | Mapping[str, Any] | str | os.PathLike[str], *, chunk: int = CHUNK
+    scenario: Scenario | dict[str, Any] | str | os.PathLike[str], *, chunk: int = CHUNK
 ) -> Simulated:
     """Simulate a survey.
 
@@ -99,7 +101,10 @@ def simulate(
         UsageError: the scenario is wrong.
     """
     if not isinstance(scenario, Scenario):
-        scenario = read_scenario(scenario if isinstance(scenario, Mapping) else _mapping(scenario))
+        scenario = read_scenario(scenario if isinstance(scenario, dict) else _mapping(scenario))
+    samples = scenario.rate_Hz * length_s(scenario.motion, scenario.rate_Hz)
+    if samples > MAX_SAMPLES:
+        raise UsageError(f"motion: {samples:.3g} samples; up to {MAX_SAMPLES:.3g} can be simulated at once")
     instrument = build_instrument(scenario.instrument)
     motion = build_motion(scenario.motion, stream(scenario.seed, "motion"), scenario.rate_Hz)
     count = int(np.floor(motion.duration_s * scenario.rate_Hz + 1e-6))
@@ -154,17 +159,13 @@ def simulate(
     )
 
 
-def _mapping(path: str | os.PathLike[str]) -> Mapping[str, Any]:
-    import yaml
+def _mapping(path: str | os.PathLike[str]) -> dict[str, Any]:
+    from magtensor.recipe.source import load_yaml
 
-    with open(path, encoding="utf-8") as file:
-        try:
-            found = yaml.safe_load(file)
-        except yaml.YAMLError as error:
-            raise UsageError(f"{os.fspath(path)}: {error}") from None
-    if not isinstance(found, Mapping):
+    value = load_yaml(os.fspath(path)).value
+    if not isinstance(value, dict):
         raise UsageError(f"{os.fspath(path)}: not a scenario (a mapping is expected)")
-    return found
+    return value
 
 
 def _averages(scenario: Scenario) -> bool:
@@ -224,11 +225,11 @@ def _recorded(scenario: Scenario, bench: Bench) -> tuple[Array, list[tuple[Effec
     """Raw output on the even time base, and the sensor effects in it."""
     spec: InstrumentSpec = scenario.instrument
     raw = bench.output()
-    noise = sensor_noise(
+    each_sensor = sensor_noise(
         spec.noise, stream(scenario.seed, "noise"), len(bench.time), scenario.rate_Hz, bench.sensors
     )
-    raw += bench.sensed(noise) if spec.noise.enters == "field" else noise
-    del noise
+    for i, noise in enumerate(each_sensor):
+        raw[:, i] += transform(bench.instrument.matrix[i], noise) if spec.noise.enters == "field" else noise
     done: list[tuple[EffectTruth, Array]] = []
     for number, effect in _numbered(scenario):
         if isinstance(effect, SensorEffectSpec):
@@ -236,7 +237,9 @@ def _recorded(scenario: Scenario, bench: Bench) -> tuple[Array, list[tuple[Effec
             raw += added
             done.append((truth, added if scenario.truth == "effects" else np.empty(0)))
     if spec.resolution_nT > 0:
-        raw = np.rint(raw / spec.resolution_nT) * spec.resolution_nT
+        raw /= spec.resolution_nT
+        np.rint(raw, out=raw)
+        raw *= spec.resolution_nT
     if spec.range_nT is not None:
         np.clip(raw, -spec.range_nT, spec.range_nT, out=raw)
     return raw, done
@@ -260,16 +263,16 @@ def _inertial(
     rng = stream(bench.seed, "inertial")
     if spec.attitude:
         tilt = np.deg2rad(spec.attitude_noise_deg) * rng.standard_normal((len(bench.time), 3))
-        attitude = multiply(motion.attitude(bench.time), exponential(tilt))
+        attitude = multiply(bench.over_time(motion.attitude), exponential(tilt))
         out["attitude"] = (rows.first(attitude), ("time", "quaternion"), "1")
     if spec.angular_rate:
         if not motion.continuous:
             raise UsageError("logging.angular_rate: this motion is a list of attitudes and has no rate")
-        rate = angular_rate(motion, bench.time)
+        rate = bench.over_time(lambda t: angular_rate(motion, t))
         rate += spec.angular_rate_noise_rad_s * rng.standard_normal(rate.shape)
         out["angular_rate"] = (rows.taken(rate), ("time", "axis"), "rad s-1")
     if spec.acceleration:
-        force = specific_force(motion, bench.time)
+        force = bench.over_time(lambda t: specific_force(motion, t))
         force += spec.acceleration_noise_m_s2 * rng.standard_normal(force.shape)
         out["acceleration"] = (rows.taken(force), ("time", "axis"), "m s-2")
     return out
@@ -278,11 +281,8 @@ def _inertial(
 def _truth(scenario: Scenario, bench: Bench, rows: _Rows, effects: list[tuple[EffectTruth, Array]]) -> Truth:
     instrument: Instrument = bench.instrument
     centre = instrument.positions.mean(axis=0)
-    tensor = np.empty((len(bench.time), 3, 3))
-    total = np.empty(len(bench.time))
-    for piece in bench.pieces():
-        tensor[piece] = bench.field.tensor(bench.time[piece], centre)
-        total[piece] = np.linalg.norm(bench.field.at(bench.time[piece], centre[None])[:, 0], axis=-1)
+    tensor = bench.over_time(lambda t: bench.field.tensor(t, centre))
+    total = bench.over_time(lambda t: np.linalg.norm(bench.field.at(t, centre[None])[:, 0], axis=-1))
     kinds = {True: rows.taken, False: lambda values: values}
     return Truth(
         b=rows.taken(bench.b),
@@ -292,6 +292,6 @@ def _truth(scenario: Scenario, bench: Bench, rows: _Rows, effects: list[tuple[Ef
         matrix=instrument.matrix,
         offset=instrument.offset,
         noise_sd=level(scenario.instrument.noise.white_sd_nT, len(instrument.names), "white_sd_nT"),
-        attitude=rows.first(bench.field.motion.attitude(bench.time)),
+        attitude=rows.first(bench.over_time(bench.field.motion.attitude)),
         effects=[replace(t, added=kinds[t.kind != "reference"](a) if a.size else a) for t, a in effects],
     )

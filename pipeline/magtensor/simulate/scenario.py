@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
 from typing import Any, Literal
 
-from pydantic import Field, ValidationError, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
-from magtensor.errors import UsageError
 from magtensor.simulate.base_station import BaseStationSpec
 from magtensor.simulate.channels import ChannelSpec, units_of
 from magtensor.simulate.effects import AnyEffect
@@ -80,17 +78,17 @@ class Scenario(Spec):
         return self
 
 
-def read_scenario(mapping: Mapping[str, Any]) -> Scenario:
+def read_scenario(mapping: dict[str, Any]) -> Scenario:
     """Check a mapping, as a YAML file holds it.
 
     Raises:
         UsageError: with every mistake on a line of its own: where, what, and the nearest known word.
     """
-    try:
-        return Scenario.model_validate(mapping)
-    except ValidationError as error:
-        lines = [
-            f"{'.'.join(str(part) for part in detail['loc']) or 'scenario'}: {detail['msg']}"
-            for detail in error.errors(include_url=False)
-        ]
-        raise UsageError("the scenario is wrong:\n  " + "\n  ".join(lines)) from None
+    from magtensor.recipe.problems import Problems
+    from magtensor.recipe.source import Document
+
+    problems = Problems(Document(mapping, "scenario"))
+    checked = problems.validated(Scenario, mapping, ())
+    problems.raise_if_any()
+    assert checked is not None
+    return checked

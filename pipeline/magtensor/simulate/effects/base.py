@@ -8,7 +8,7 @@ that the effect has the rms asked for.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Literal
 
@@ -75,6 +75,10 @@ class Bench:
         out += self.instrument.offset
         return out
 
+    def over_time(self, function: Callable[[Array], Array]) -> Array:
+        """A function of times (n,) that gives (n, ...), over the whole time base."""
+        return np.concatenate([function(self.time[piece]) for piece in self.pieces()])
+
     def field_at(self, time: Array, offsets: Array) -> Array:
         """Field (N, S', 3) nT at other times (N,) s or places, (S', 3) or (N, S', 3) m."""
         out = np.empty((len(time), offsets.shape[-2], 3))
@@ -94,7 +98,10 @@ class Bench:
             UsageError: the scenario has no such channel.
         """
         if name not in self.channels:
-            raise UsageError(f"effect {effect}: no channel {name!r}{did_you_mean(name, self.channels)}")
+            raise UsageError(
+                f"effect {effect}: no channel {name!r}{did_you_mean(name, self.channels)}; "
+                f"the scenario has {', '.join(self.channels) or 'none'}"
+            )
         values = self.channels[name].values
         return values if values.ndim == 2 else np.repeat(values[:, None], self.sensors, axis=1)
 
@@ -225,7 +232,7 @@ def sensor_effect(
     affected = spec.sensors or known
     for sensor in affected:
         if sensor not in known:
-            raise UsageError(f"effect {spec.name}: no sensor {sensor!r}{did_you_mean(sensor, known)}")
+            raise UsageError(f"effect {spec.name}: no sensor {sensor!r}; the array has {', '.join(known)}")
     idle = [i for i, sensor in enumerate(known) if sensor not in affected]
 
     def run(values: Array) -> tuple[Array, float]:

@@ -78,10 +78,7 @@ def site_effect(spec: SiteEffectSpec, number: int, bench: Bench) -> tuple[Effect
         values = np.array(spec.given, dtype=float)
     source = spec.source(values)
     model = bench.field.with_sources([source])
-    b = np.empty((len(bench.time), bench.sensors, 3))
-    for piece in bench.pieces():
-        b[piece] = model.local(bench.time[piece], bench.instrument.positions)
-    added = bench.sensed(b)
+    added = bench.sensed(bench.over_time(lambda t: model.local(t, bench.instrument.positions)))
     rms = rms_of(added, bench.kept, bench.sensors)
     if spec.rms_nT is not None:
         factor = scaled_to(spec, rms, spec.rms_nT)
