@@ -86,10 +86,11 @@ def three_angles(target: Array, source: Array) -> Alignment:
         gradient = np.einsum("kij,ij->k", derivatives, moments)
         normal = np.einsum("kij,jl,mil->km", derivatives, gram, derivatives)
         step = np.linalg.lstsq(normal, gradient, rcond=None)[0]
-        while np.linalg.norm(step) > 1e-14 and cost(angles + step) > cost(angles):
+        # near the minimum the cost is flat to rounding, and a step must not be halved for that
+        while cost(angles + step) > cost(angles) + 1e-12 * total:
             step = step / 2
         angles = angles + step
-        if np.linalg.norm(step) < 1e-13:
+        if np.linalg.norm(step) < 1e-12:
             rotation = sequence(LI_SEQUENCE[::-1], angles)
             return Alignment(rotation, _least_squares_turn(source @ rotation.T))
     raise DataError(
