@@ -15,7 +15,7 @@ import inspect
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 if TYPE_CHECKING:
     from pydantic import BaseModel
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 F = TypeVar("F", bound=Callable[..., Any])
 
 MARK = "__magtensor__"
-KINDS = ("stage", "method", "reader", "metric")
+KINDS = ("stage", "method", "reader", "metric", "error_model")
 
 
 class Method:
@@ -69,6 +69,8 @@ class Component:
     step: str = ""  # of a method: the stage it serves
     source: str = ""  # paper and equations
     suffixes: tuple[str, ...] = ()  # of a reader: the file names it recognises
+    effect: Literal["", "instrument", "site", "reference"] = ""  # of an error model: what it is an error of
+    typical: str = ""  # of an error model: its usual magnitude
 
     @cached_property
     def summary(self) -> str:
@@ -178,6 +180,28 @@ def reader(*, name: str | None = None, suffixes: Iterable[str] = ()) -> Callable
 def metric(*, name: str | None = None, needs: Iterable[str] = (), uses: Iterable[str] = ()) -> Callable[[F], F]:
     """Mark ``function(survey, *, options) -> list[Verdict]`` as a QC metric."""
     return _mark("metric", name, declares=Declares(tuple(needs), tuple(uses)))
+
+
+def error_model(
+    effect: Literal["instrument", "site", "reference"],
+    *,
+    name: str | None = None,
+    needs: Iterable[str] = (),
+    source: str = "",
+    typical: str = "",
+) -> Callable[[F], F]:
+    """Mark ``function(x: Excitation, *, settings) -> Terms`` as an error model.
+
+    Args:
+        effect: "instrument" (corrected in every survey), "site" (modelled while calibrating, never taken off
+            another survey's field) or "reference" (corrects the total field).
+        name: the function's own if left out.
+        needs: channels and facts without which it cannot be tried: names of channels (`temperature`,
+            `current_*`), `attitude`, `position`, `total_field`, `rotation` (samples dense enough for rates of change).
+        source: where the model comes from.
+        typical: its usual magnitude, in words.
+    """
+    return _mark("error_model", name, declares=Declares(tuple(needs)), effect=effect, source=source, typical=typical)
 
 
 def component_of(candidate: object) -> Component | None:

@@ -1,0 +1,209 @@
+"""What an error model may look at: time, field, channels; and the few ways in which effects act on sensors."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from fnmatch import fnmatchcase
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magtensor.calibration.types import Array
+from magtensor.errors import did_you_mean
+from magtensor.loop.terms import REFERENCE, Terms
+
+AXES = "xyz"
+
+
+@dataclass(frozen=True)
+class Excitation:
+    """A survey as error models see it.
+
+    Attributes:
+        time: (N,) s on the survey's clock.
+        start: s, where the survey's time begins (drift and warm-up count from here).
+        sensors: names.
+        output: (N, S, 3) nT, raw output without noise as far as known: C b + o of the fitted field.
+        field: (N, S, 3) nT at each sensor, in the common frame.
+        total_field: (N,) nT of the reference; None where there is none.
+        logged: name -> (N,), (N, S) or (N, 3); the mean over the calibration survey taken off.
+        units: name -> units of the channel.
+        run: (N,) number of the contiguous run a sample belongs to (a gap or a new segment starts one).
+        segment: (N,) the survey's own segment number; all 0 where it has none.
+        position: (S, 3) m; None where not known.
+        attitude: (N, 4) scalar last, platform to world; None where not known.
+        lines: Hz, the strongest lines in the residual's spectrum, for models that look for one.
+    """
+
+    time: Array
+    start: float
+    sensors: tuple[str, ...]
+    output: Array
+    field: Array
+    total_field: Array | None
+    logged: Mapping[str, Array]
+    units: Mapping[str, str]
+    run: NDArray[np.int_]
+    segment: NDArray[np.int_]
+    position: Array | None = None
+    attitude: Array | None = None
+    lines: Sequence[float] = field(default_factory=tuple)
+
+    @property
+    def duration(self) -> float:
+        """s, from first to last sample."""
+        return float(self.time[-1] - self.time[0])
+
+    @property
+    def elapsed(self) -> Array:
+        """(N,) s since the survey's start."""
+        return self.time - self.start
+
+    def channels_like(self, pattern: str, without: tuple[str, ...] = ()) -> list[str]:
+        """The logged channels whose names fit."""
+        return sorted(
+            n for n in self.logged if fnmatchcase(n, pattern) and not any(fnmatchcase(n, w) for w in without)
+        )
+
+    def channel(self, name: str) -> Array:
+        """A logged channel, (N,), (N, S) or (N, 3).
+
+        Raises:
+            KeyError: there is none of that name.
+        """
+        if name not in self.logged:
+            raise KeyError(f"no channel {name}{did_you_mean(name, self.logged)}")
+        return self.logged[name]
+
+    def relaxed(self, series: Array, tau: float) -> Array:
+        """A series (N, ...) seen through a first-order lag tau, s, exact for samples joined by straight lines.
+
+        Each run starts in equilibrium with its first value.
+        """
+        if tau <= 0:
+            return series
+        out = np.array(series, dtype=float)
+        for a, b in self.runs():
+            out[a:b] = _first_order(self.time[a:b], out[a:b], tau)
+        return out
+
+    def derivative(self, series: Array) -> Array:
+        """d/dt of a series (N, ...), 1/s, within each run; zero where a run is a single sample."""
+        out = np.zeros_like(np.asarray(series, dtype=float))
+        for a, b in self.runs():
+            if b - a >= 5:
+                out[a:b] = _derivative(self.time[a:b], series[a:b])
+            elif b - a >= 2:
+                out[a:b] = np.gradient(series[a:b], self.time[a:b], axis=0)
+        return out
+
+    def runs(self) -> list[tuple[int, int]]:
+        """(first, one past last) sample of each contiguous run."""
+        edges = np.flatnonzero(np.diff(self.run)) + 1
+        bounds = [0, *edges.tolist(), len(self.run)]
+        return list(zip(bounds[:-1], bounds[1:], strict=True))
+
+    # The ways in which effects act.
+
+    def offsets(self, series: Array, units: str, name: str = "") -> Terms:
+        """A series (N,), or one for each sensor (N, S), added to every axis: one coefficient an axis."""
+        columns = np.asarray(series, dtype=float).reshape(len(self.time), -1)
+        shared = columns.shape[1] == 1
+        outputs = np.arange(3 * len(self.sensors))
+        return self._single(columns, outputs, np.zeros_like(outputs) if shared else outputs // 3, units, name)
+
+    def scales(self, series: Array, units: str, name: str = "") -> Terms:
+        """A series (N,) or (N, S) times the axis's own output: one coefficient an axis."""
+        factor = np.asarray(series, dtype=float).reshape(len(self.time), -1, 1)
+        return self.responses(self.output * factor, units, name)
+
+    def responses(self, series: Array, units: str, name: str = "") -> Terms:
+        """A series for each axis of each sensor, (N, S, 3): one coefficient an axis."""
+        columns = np.asarray(series, dtype=float).reshape(len(self.time), -1)
+        outputs = np.arange(columns.shape[1])
+        return self._single(columns, outputs, outputs, units, name)
+
+    def matrices(self, series: Array, units: str) -> Terms:
+        """A vector (N, 3), or one for each sensor (N, S, 3), that reaches every axis through a matrix: nine each."""
+        s = len(self.sensors)
+        values = np.asarray(series, dtype=float)
+        shared = values.ndim == 2
+        columns = values.reshape(len(self.time), -1)
+        outputs = np.repeat(np.arange(3 * s), 3)
+        component = np.tile(np.arange(3), 3 * s)
+        index = component if shared else 3 * (outputs // 3) + component
+        names = tuple(AXES[o % 3] + AXES[c] for o, c in zip(outputs, component, strict=True))
+        return Terms(
+            names, tuple(self.sensors[o // 3] for o in outputs), (units,) * len(names), columns,
+            np.arange(len(names)), outputs, index,
+        )  # fmt: skip
+
+    def one_each(self, series: Array, units: str, name: str) -> Terms:
+        """A vector for each sensor (N, S, 3) with one coefficient a sensor."""
+        s = len(self.sensors)
+        columns = np.asarray(series, dtype=float).reshape(len(self.time), -1)
+        outputs = np.arange(3 * s)
+        return Terms((name,) * s, self.sensors, (units,) * s, columns, outputs // 3, outputs, outputs)
+
+    def shared(self, series: Array, units: str, name: str) -> Terms:
+        """One coefficient for a pattern (N, S, 3) over all sensors."""
+        columns = np.asarray(series, dtype=float).reshape(len(self.time), -1)
+        outputs = np.arange(columns.shape[1])
+        return Terms((name,), ("",), (units,), columns, np.zeros_like(outputs), outputs, outputs)
+
+    def on_reference(self, series: Array, units: str, name: str) -> Terms:
+        """One coefficient for a series (N,) that the reference total field holds."""
+        index = np.zeros(1, dtype=int)
+        return Terms((name,), ("",), (units,), np.asarray(series, dtype=float)[:, None], index, index + REFERENCE, index)
+
+    def _single(self, columns: Array, outputs: NDArray[np.int_], index: NDArray[np.int_], units: str, name: str) -> Terms:
+        return Terms(
+            tuple(f"{name}{AXES[o % 3]}" for o in outputs),
+            tuple(self.sensors[o // 3] for o in outputs),
+            (units,) * len(outputs),
+            columns,
+            np.arange(len(outputs)),
+            outputs,
+            index,
+        )
+
+
+def _first_order(time: Array, series: Array, tau: float) -> Array:
+    """Exact response of tau y' + y = x to x linear between samples, y starting at x[0]."""
+    from scipy.signal import lfilter
+
+    if len(time) < 2:
+        return series
+    step = np.diff(time)
+    if np.ptp(step) < 1e-6 * step.mean():
+        decay = float(np.exp(-step.mean() / tau))
+        ramp = 1.0 - (1.0 - decay) * tau / step.mean()  # weight of the new sample beyond the old
+        hold = 1.0 - decay - ramp
+        lagged = np.concatenate([series[:1], series[:-1]])
+        driven = ramp * series + hold * lagged
+        driven[0] = 0.0
+        state = np.broadcast_to(series[0] * decay, (1, *series.shape[1:]))
+        tail = lfilter([1.0], [1.0, -decay], driven[1:], axis=0, zi=np.asarray(state, dtype=float))[0]
+        out: Array = np.concatenate([series[:1], tail])
+        return out
+    out = np.array(series, dtype=float)
+    decays = np.exp(-step / tau)
+    ramps = 1.0 - (1.0 - decays) * tau / step
+    for k in range(1, len(out)):
+        out[k] = decays[k - 1] * out[k - 1] + ramps[k - 1] * series[k] + (1 - decays[k - 1] - ramps[k - 1]) * series[k - 1]
+    return out
+
+
+def _derivative(time: Array, series: Array) -> Array:
+    """Fourth-order central differences where samples are evenly spaced, else those of a cubic spline."""
+    step = np.diff(time)
+    if np.ptp(step) < 1e-3 * step.mean():
+        x, h = np.asarray(series, dtype=float), float(step.mean())
+        out = np.gradient(x, h, axis=0, edge_order=2)
+        out[2:-2] = (x[:-4] - 8 * x[1:-3] + 8 * x[3:-1] - x[4:]) / (12 * h)
+        return out
+    from scipy.interpolate import CubicSpline
+
+    found: Array = CubicSpline(time, series, axis=0)(time, 1)
+    return found

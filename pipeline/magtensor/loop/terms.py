@@ -1,0 +1,88 @@
+"""Regressors: what a unit of each coefficient adds to the raw outputs, or to the reference."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magtensor.calibration.types import Array
+
+REFERENCE = -1  # the output number of the reference total field
+
+
+@dataclass(frozen=True)
+class Terms:
+    """P coefficients and their regressors, stored without repeating a series that several outputs share.
+
+    Attributes:
+        names: (P,) the coefficient's name within its sensor ("x", "xy").
+        sensors: (P,) the sensor's name, "" for one shared by all or of the reference.
+        units: (P,) of the coefficient.
+        series: (N, K) distinct regressors, nT per unit of the coefficient.
+        part_term, part_output, part_series: (Q,) each part adds coefficient times series to an output, numbered
+            3 * sensor + axis, or REFERENCE.
+    """
+
+    names: tuple[str, ...]
+    sensors: tuple[str, ...]
+    units: tuple[str, ...]
+    series: Array
+    part_term: NDArray[np.int_]
+    part_output: NDArray[np.int_]
+    part_series: NDArray[np.int_]
+
+    @property
+    def count(self) -> int:
+        """P."""
+        return len(self.names)
+
+    def contribution(self, coefficients: Array, outputs: int) -> Array:
+        """(N, outputs) nT that the coefficients (P,) add to the raw outputs."""
+        weights = np.zeros((self.series.shape[1], outputs))
+        raw = self.part_output >= 0
+        np.add.at(weights, (self.part_series[raw], self.part_output[raw]), coefficients[self.part_term[raw]])
+        out: Array = self.series @ weights
+        return out
+
+    def on_reference(self, coefficients: Array) -> Array:
+        """(N,) nT that the coefficients add to the reference total field."""
+        weights = np.zeros(self.series.shape[1])
+        own = self.part_output == REFERENCE
+        np.add.at(weights, self.part_series[own], coefficients[self.part_term[own]])
+        out: Array = self.series @ weights
+        return out
+
+    def only(self, keep: Iterable[int]) -> Terms:
+        """The terms of these numbers, in this order."""
+        order = list(keep)
+        place = {old: new for new, old in enumerate(order)}
+        parts = [i for i, t in enumerate(self.part_term) if int(t) in place]
+        return Terms(
+            tuple(self.names[i] for i in order),
+            tuple(self.sensors[i] for i in order),
+            tuple(self.units[i] for i in order),
+            self.series,
+            np.array([place[int(self.part_term[i])] for i in parts], dtype=int),
+            self.part_output[parts],
+            self.part_series[parts],
+        )
+
+
+def joined(parts: list[Terms]) -> Terms:
+    """All terms of several models, one after the other."""
+    if len(parts) == 1:
+        return parts[0]
+    terms = np.cumsum([0, *(p.count for p in parts)])
+    series = np.cumsum([0, *(p.series.shape[1] for p in parts)])
+    return Terms(
+        tuple(n for p in parts for n in p.names),
+        tuple(s for p in parts for s in p.sensors),
+        tuple(u for p in parts for u in p.units),
+        np.hstack([p.series for p in parts]),
+        np.concatenate([p.part_term + terms[i] for i, p in enumerate(parts)]),
+        np.concatenate([p.part_output for p in parts]),
+        np.concatenate([p.part_series + series[i] for i, p in enumerate(parts)]),
+    )
