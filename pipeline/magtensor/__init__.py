@@ -10,6 +10,7 @@ _LAZY = {
     "method": "magtensor.components",
     "reader": "magtensor.components",
     "metric": "magtensor.components",
+    "error_model": "magtensor.components",
     "MethodChoice": "magtensor.components",
     "MetricsChoice": "magtensor.components",
     "DataError": "magtensor.errors",
@@ -23,6 +24,7 @@ __all__ = [
     "NotEnoughData",
     "UsageError",
     "__version__",
+    "error_model",
     "method",
     "metric",
     "reader",
@@ -30,7 +32,7 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
-    from magtensor.components import MethodChoice, MetricsChoice, method, metric, reader, stage
+    from magtensor.components import MethodChoice, MetricsChoice, error_model, method, metric, reader, stage
     from magtensor.errors import DataError, NotEnoughData, UsageError
 
 
