@@ -400,6 +400,11 @@ def test_unlogged_channels_act_but_are_not_written() -> None:
         ),
         ({"type": "position_error", "rms_nT": 1.0}, {}, "adds nothing"),
         ({"type": "warm_up", "nT": [[1.0, 1.0, 1.0]] * 3}, {}, "3 vectors; the array has 4 sensors"),
+        (
+            {"type": "reference_clock", "offset_s": 1e6},
+            {"base_station": {"rate_Hz": 1.0}},
+            "a clock error of 1e",
+        ),
         ({"type": "clock_drift", "ppm": [1e7, 0.0, 0.0, 0.0]}, {}, "time error of"),
         (
             {"type": "sampling_lag", "rms_nT": 1.0},

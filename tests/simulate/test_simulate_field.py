@@ -115,7 +115,7 @@ def test_uniform_site_gradient_turns_with_the_platform() -> None:
 
 def test_diurnal_variation_peaks_at_noon() -> None:
     spec = VariationSpec.model_validate({"diurnal": {"amplitude_nT": [1.0, -20.0, 5.0], "start_hour": 9.0}})
-    variation = Variation(spec, np.random.default_rng(1), (0.0, 86400.0))
+    variation = Variation(spec, np.random.default_rng(1), 86400.0)
     t = np.arange(0.0, 86400.0, 60.0)
     assert t[np.argmin(variation(t)[:, 1])] == pytest.approx(3 * 3600, abs=60)
     np.testing.assert_allclose(variation(np.array([3 * 3600.0]))[0], [1.0, -20.0, 5.0])
@@ -125,7 +125,7 @@ def test_pulsations_have_their_rms_and_period() -> None:
     spec = VariationSpec.model_validate(
         {"pulsations": [{"rms_nT": 2.0, "period_s": 30.0, "direction": [0.0, 1.0, 0.0]}]}
     )
-    variation = Variation(spec, np.random.default_rng(1), (0.0, 1e5))
+    variation = Variation(spec, np.random.default_rng(1), 1e5)
     wave = variation(np.arange(0.0, 1e5))[:, 1]
     assert wave.std() == pytest.approx(2.0, rel=0.05)
     frequency, density = welch(wave, 1.0, nperseg=4096)

@@ -297,6 +297,10 @@ def test_shapes(shape: str, count: int) -> None:
         ({"instrument": NOISELESS["instrument"] | {"errors": [{}]}}, "1 entries; the array has 4 sensors"),
         ({"field": {"earth": {"total_field_nT": 5e4}}}, "vector_nT"),
         ({"motion": {"type": "tumbling", "duration_s": 0.01}}, "shorter than one sample"),
+        ({"motion": {"type": "postures", "random_count": 0}}, "shorter than one sample"),
+        ({"base_station": {"first_s": -1e6}}, "base_station: readings up to 86400 s before"),
+        ({"base_station": {"first_s": 50.0, "last_s": 40.0}}, "no reading is left"),
+        ({"motion": {"type": "euler_grid", "step_deg": 0.1}}, "4.67e\\+10 samples"),
         ({"motion": {"type": "tumbling", "duration_s": 1e9}}, "1e\\+10 samples"),
     ],
 )

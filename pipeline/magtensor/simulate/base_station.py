@@ -10,8 +10,8 @@ from pydantic import Field
 
 from magtensor.errors import UsageError
 from magtensor.simulate.effects.base import EffectTruth
-from magtensor.simulate.effects.reference import ReferenceEffectSpec, reference_effect
-from magtensor.simulate.field import Variation
+from magtensor.simulate.effects.reference import MAX_CLOCK_ERROR_S, ReferenceEffectSpec, reference_effect
+from magtensor.simulate.field import VARIATION_REACH_S, Variation
 from magtensor.simulate.spec import Array, Spec
 
 
@@ -35,7 +35,9 @@ class BaseStationSpec(Spec):
     noise_sd_nT: float = Field(0.05, ge=0, description="standard deviation of a reading, nT")
     resolution_nT: float = Field(0.01, ge=0, description="step of a reading, nT; 0: none")
     difference_nT: float = Field(0.0, description="steady difference of the total field, base minus site, nT")
-    latency_s: float = Field(0.0, description="known delay: time stamp minus time of measurement, s")
+    latency_s: float = Field(
+        0.0, ge=-3600, le=3600, description="known delay: time stamp minus time of measurement, s"
+    )
     gaps: list[GapSpec] = Field(default=[], description="times without readings")
 
 
@@ -50,8 +52,8 @@ class Reference:
 BASE_MARGIN_S = 60.0
 
 
-def reference_span(spec: BaseStationSpec, duration_s: float) -> tuple[float, float]:
-    """First and last time at which the base station may read, s."""
+def reading_times(spec: BaseStationSpec, duration_s: float) -> tuple[float, float]:
+    """First and last time stamp the base station may have, s."""
     first = -BASE_MARGIN_S if spec.first_s is None else spec.first_s
     last = duration_s + BASE_MARGIN_S if spec.last_s is None else spec.last_s
     return first, last
@@ -68,9 +70,14 @@ def read_base_station(
     """The readings, and for each reference effect its truth and what it added to them.
 
     Raises:
-        UsageError: no reading is left.
+        UsageError: no reading is left, or they reach days beyond the survey.
     """
-    first, last = reference_span(spec, duration_s)
+    first, last = reading_times(spec, duration_s)
+    reach = VARIATION_REACH_S - MAX_CLOCK_ERROR_S - abs(spec.latency_s)
+    if first < -reach or last > duration_s + reach:
+        raise UsageError(
+            f"base_station: readings up to {reach:g} s before and after the survey can be simulated"
+        )
     stamp = first + np.arange(max(0, int(np.floor((last - first) * spec.rate_Hz + 1e-9)) + 1)) / spec.rate_Hz
     recorded = np.ones(len(stamp), dtype=bool)
     for gap in spec.gaps:

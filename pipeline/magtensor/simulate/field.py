@@ -17,6 +17,7 @@ from magtensor.simulate.sources import DipoleSpec, Source
 from magtensor.simulate.spec import Array, Spec, Vector3
 
 DAY_H = 24.0
+VARIATION_REACH_S = 2 * 86400.0  # how far before and after the survey the variation is defined
 TONES = 24  # sinusoids that make up one band of pulsations
 
 
@@ -90,7 +91,7 @@ class FieldSpec(Spec):
 class Variation:
     """The change of the Earth field with time, (n, 3) nT in the world frame at times (n,) s."""
 
-    def __init__(self, spec: VariationSpec, rng: np.random.Generator, span: tuple[float, float]) -> None:
+    def __init__(self, spec: VariationSpec, rng: np.random.Generator, duration_s: float) -> None:
         self.spec = spec
         self.bands = []
         for band in spec.pulsations:
@@ -98,6 +99,7 @@ class Variation:
             phase = rng.uniform(0, 2 * np.pi, TONES)
             direction = np.array(band.direction) / np.linalg.norm(band.direction)
             self.bands.append((frequency, phase, band.rms_nT * np.sqrt(2 / TONES) * direction))
+        span = (-VARIATION_REACH_S, duration_s + VARIATION_REACH_S)
         self.irregular = (
             SmoothRandom(rng, span, spec.irregular.time_s, spec.irregular.rms_nT, 3)
             if spec.irregular

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from magtensor.errors import UsageError
-from magtensor.simulate.base_station import Reference, read_base_station, reference_span
+from magtensor.simulate.base_station import Reference, read_base_station
 from magtensor.simulate.channels import build_channels, logged
 from magtensor.simulate.effects.base import CHUNK, Bench, EffectTruth, SensorEffectSpec, sensor_effect
 from magtensor.simulate.effects.reference import ReferenceEffectSpec
@@ -22,7 +22,6 @@ from magtensor.simulate.effects.site import SiteEffectSpec, site_effect
 from magtensor.simulate.field import FieldModel, Variation
 from magtensor.simulate.instrument import Instrument, InstrumentSpec, build_instrument
 from magtensor.simulate.motion import (
-    MARGIN_S,
     NOT_RECORDED,
     Motion,
     angular_rate,
@@ -115,11 +114,7 @@ def simulate(
     kept = np.flatnonzero(segment != NOT_RECORDED)
 
     base = scenario.base_station
-    span = (-MARGIN_S, motion.duration_s + MARGIN_S)
-    if base is not None:
-        first, last = reference_span(base, motion.duration_s)
-        span = (min(span[0], first - MARGIN_S), max(span[1], last + MARGIN_S))
-    variation = Variation(scenario.field.variation, stream(scenario.seed, "variation"), span)
+    variation = Variation(scenario.field.variation, stream(scenario.seed, "variation"), motion.duration_s)
     earth = scenario.field.earth.vector()
     dipoles = [Dipole(np.array(d.position_m), np.array(d.moment_Am2)) for d in scenario.field.dipoles]
     bench = Bench(

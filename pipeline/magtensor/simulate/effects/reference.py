@@ -8,10 +8,14 @@ from typing import ClassVar, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
+from magtensor.errors import UsageError
 from magtensor.simulate.effects.base import EffectSpec, EffectTruth, Kind, scaled_to
 from magtensor.simulate.spec import Array
 
 TotalField = Callable[[Array, float], Array]  # (times (n,) s, diurnal ratio) -> (n,) nT at the base station
+
+
+MAX_CLOCK_ERROR_S = 86400.0  # a time zone, or the wrong day
 
 
 class ReferenceEffectSpec(EffectSpec):
@@ -54,6 +58,10 @@ class ReferenceClock(ReferenceEffectSpec):
     def waveform(self, total_field: TotalField, stamp: Array, coefficients: Array) -> Array:
         drift = 1e-6 * self.drift_ppm * float(coefficients) / float(self.values() or 1.0)
         late = float(coefficients) + drift * stamp
+        if not np.abs(late).max() <= MAX_CLOCK_ERROR_S:
+            raise UsageError(
+                f"effect reference_clock: a clock error of {np.abs(late).max():.3g} s; up to one day can be simulated"
+            )
         return total_field(stamp - late, 1.0) - total_field(stamp, 1.0)
 
 
