@@ -17,10 +17,11 @@ Bools = NDArray[np.bool_]
 # sensor shows, at 31 km height it is 1.5 % less. Half and twice are far from every factor between two units.
 EARTH_FIELD_NT = (22_000.0, 67_000.0)
 MARGIN = 2.0
-RIVAL_UNITS = {
-    "uT": 1e3, "mT": 1e6, "T": 1e9, "mG": 1e2, "G": 1e5, "pT": 1e-3, "nT already multiplied by 1000": 1e-3,
-    "nT already multiplied by 1e6": 1e-6,
-}  # fmt: skip
+# What a number that was labelled nT may have been, with the factor that makes nT of it.
+RIVALS = (
+    ("uT labelled nT", 1e3), ("mG labelled nT", 1e2), ("G labelled nT", 1e5), ("mT labelled nT", 1e6),
+    ("T labelled nT", 1e9), ("pT labelled nT, or uT converted twice", 1e-3), ("T converted twice", 1e-9),
+)  # fmt: skip
 
 
 def moves_on(time: Floats) -> Bools:
@@ -77,24 +78,36 @@ def sampling(time: Floats) -> Sampling:
 def resolution(values: Floats) -> float:
     """The quantisation step of a channel, 0 where none shows.
 
-    The smallest difference between recorded values is the step if all other differences are whole multiples of it
-    (to 1 %, as decimal text rounds) and values repeat; noise that was never quantised hardly ever repeats.
+    The largest number of which (nearly) all differences between recorded values are whole multiples, found as
+    Euclid finds a common divisor; 2 % of a step is granted for rounding and 5 % of the differences for corrupt
+    values. Noise that was never quantised hardly ever repeats, and its common divisor falls to the rounding error.
 
     Args:
         values: (N,) numbers, NaN allowed.
     """
-    distinct = np.unique(values[np.isfinite(values)])
-    if len(distinct) < 3 or len(distinct) > 0.9 * np.isfinite(values).sum():
+    finite = values[np.isfinite(values)]
+    distinct = np.unique(finite)
+    if len(distinct) < 3 or len(distinct) > 0.9 * len(finite):
         return 0.0
+    largest = max(abs(distinct[0]), abs(distinct[-1]))
     steps = np.diff(distinct)
     # Numbers that differ by rounding only (0.1 + 0.2 and 0.3) are the same recorded value.
-    steps = steps[steps > 1e-9 * max(abs(distinct[0]), abs(distinct[-1]))]
-    if len(steps) == 0:
+    steps = steps[steps > 1e-9 * largest]
+    if len(steps) < 2:
         return 0.0
-    # The smallest step alone may be off by the rounding of two printed numbers; the mean of those near it is not.
-    step = float(steps[steps < 1.5 * steps.min()].mean())
-    multiples = steps / step
-    return step if np.mean(np.abs(multiples - np.round(multiples)) < 0.01 * np.maximum(multiples, 1)) > 0.95 else 0.0
+    step = float(steps.min())
+    while step > 1e-8 * largest:
+        # The shortest difference may be off by the rounding of two printed numbers; the mean of short ones is less.
+        short = steps[steps < 10.5 * step]
+        step = float(short.sum() / np.round(short / step).sum()) if len(short) else step
+        rest = np.abs(steps - np.round(steps / step) * step)
+        off = rest > 0.02 * step
+        if off.mean() <= 0.05:
+            return step
+        if len(distinct) < 5:
+            return 0.0  # two or three differences have a common divisor by chance
+        step = float(rest[off].min())
+    return 0.0
 
 
 def runs(equal: Bools) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
@@ -246,9 +259,9 @@ def unit_suspicion(median_nT: float) -> str | None:
     low, high = EARTH_FIELD_NT
     if low / MARGIN <= median_nT <= high * MARGIN:
         return None
-    fitting = [unit for unit, factor in RIVAL_UNITS.items() if low <= median_nT * factor <= high]
+    fitting = [what for what, factor in RIVALS if low <= median_nT * factor <= high]
     shown = f"the median magnitude is {median_nT:.6g} nT, the Earth's field is {low:g} to {high:g} nT"
-    return f"{shown}; looks like {fitting[0]} labelled nT" if fitting else shown
+    return f"{shown}; looks like {fitting[0]}" if fitting else shown
 
 
 def copies(field: Floats) -> list[tuple[int, int, int, int]]:

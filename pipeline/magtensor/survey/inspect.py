@@ -88,7 +88,7 @@ def describe(file: Path, readers: Mapping[str, Component], reader: str | None = 
     from magtensor.survey.propose import propose
 
     name, tables = _read(file, readers, reader)
-    facts = tuple(column_facts(c, i) for i, c in enumerate(tables.columns.values()))
+    facts = tuple(column_facts(n, c, i) for i, (n, c) in enumerate(tables.columns.items()))
     raw = tables.columns.get("b_raw")
     canonical = "time" in tables.columns and raw is not None and len(raw.shape) == 3
     return FileFacts(
@@ -126,9 +126,9 @@ def _read(file: Path, readers: Mapping[str, Component], reader: str | None) -> t
     raise DataError("no reader understands this file", where=file.name, hint="\n  ".join(f"{f.what}" for f in failures))
 
 
-def column_facts(column: Column, number: int) -> ColumnFacts:
+def column_facts(name: str, column: Column, number: int) -> ColumnFacts:
     """What can be said of one column; one that cannot be read is described as such."""
-    facts = {"name": column.name, "number": number, "shape": column.shape, "dims": column.dims, "units": column.units}
+    facts = {"name": name, "number": number, "shape": column.shape, "dims": column.dims, "units": column.units}
     try:
         values = np.asarray(column.load())
     except DataError as error:

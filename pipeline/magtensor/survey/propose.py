@@ -268,9 +268,7 @@ def _attitude(tables: Tables, rows: int, guess: _Guess) -> None:
         values = numbers_of(column)
         if values is not None and abs(np.nanmedian(np.linalg.norm(values, axis=1)) - 1) < 0.01:
             guess.used.add(column.name)
-            guess.rest.append(
-                f"  attitude: {{from: {_quoted(column.name)}, scalar: first}}  # check: is the scalar part first or last?"
-            )
+            guess.rest.append(f"  attitude: {{from: {_quoted(column.name)}, scalar: first}}  # check: first or last?")
             return
     angles = {}
     for column in tables.columns.values():
