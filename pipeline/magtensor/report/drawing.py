@@ -1,0 +1,147 @@
+"""The look of the pictures, and how a matplotlib figure becomes a piece of the page.
+
+Figures are drawn in the colours of light paper; in the SVG each colour becomes a CSS variable, so that the same
+picture follows the reader's dark or light scheme and prints dark on white.
+"""
+
+from __future__ import annotations
+
+import base64
+import io
+import re
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from magtensor.calibration.types import Array
+from magtensor.report.reduction import COLUMNS, Envelope, envelope
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+# (light, dark); the light ones are told apart by readers who do not see red from green (Okabe and Ito)
+INK, MUTED, GRID, WASH, ALARM = "#1c2733", "#5d6b7a", "#dde3ea", "#eef2f6", "#b42318"
+SERIES = ("#0a6fb0", "#cf5a00", "#00876a", "#b3528f", "#8a6d00", "#3f96d4", "#6b4fbb", "#707b86")
+DARK = {
+    INK: "#dfe6ee", MUTED: "#9aa8b6", GRID: "#313d4a", WASH: "#222c37", ALARM: "#ff8a7a",
+    "#0a6fb0": "#5fb3f0", "#cf5a00": "#ff9a4d", "#00876a": "#3ecfa8", "#b3528f": "#e58fc4",
+    "#8a6d00": "#d9b945", "#3f96d4": "#9ad0fb", "#6b4fbb": "#b09cf5", "#707b86": "#b3bdc7",
+}  # fmt: skip
+FONTS = "system-ui,'Segoe UI','Helvetica Neue',Arial,'DejaVu Sans',sans-serif"
+WIDTH = 10.6  # inches, of a picture as wide as the page
+MOST_SENSORS = 12  # rows of a picture
+STYLE: dict[Any, Any] = {
+    "svg.fonttype": "none", "svg.hashsalt": "magtensor", "text.parse_math": False, "font.size": 8.5,
+    "font.family": ["DejaVu Sans"], "axes.titlesize": 8.5, "axes.titleweight": "bold", "axes.titlelocation": "left",
+    "axes.titlepad": 4.0, "axes.labelsize": 8.5, "axes.linewidth": 0.7, "axes.edgecolor": MUTED,
+    "axes.labelcolor": INK, "axes.titlecolor": INK, "axes.facecolor": "none", "axes.spines.top": False,
+    "axes.spines.right": False, "axes.grid": True, "axes.axisbelow": True, "axes.formatter.useoffset": False,
+    "axes.unicode_minus": True, "grid.color": GRID, "grid.linewidth": 0.6, "text.color": INK, "xtick.color": MUTED,
+    "ytick.color": MUTED, "xtick.labelcolor": INK, "ytick.labelcolor": INK, "xtick.labelsize": 8, "ytick.labelsize": 8,
+    "figure.facecolor": "none", "savefig.facecolor": "none", "legend.frameon": False, "legend.fontsize": 8,
+    "lines.solid_capstyle": "round", "path.simplify": True, "date.converter": "auto",
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A figure ready for the page: a data URI of an SVG, its size in CSS pixels, and the words around it."""
+
+    title: str
+    caption: str
+    uri: str
+    width: int
+    height: int
+
+
+def picture(title: str, caption: str, draw: Callable[[], Figure]) -> Picture:
+    """Draw a figure in the report's style and make it a picture; the same data give the same bytes."""
+    import matplotlib
+
+    with matplotlib.rc_context(STYLE), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Glyph .* missing from")  # the reader's browser has other fonts
+        figure = draw()
+        text = svg(figure)
+    width, height = figure.get_size_inches() * 96
+    data = base64.b64encode(text.encode()).decode("ascii")
+    return Picture(title, caption, f"data:image/svg+xml;base64,{data}", round(width), round(height))
+
+
+def svg(figure: Figure) -> str:
+    """A figure as SVG text: colours as CSS variables, the reader's own fonts, coordinates to a hundredth of a point."""
+    buffer = io.StringIO()
+    figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
+    text = buffer.getvalue()
+    text = text[text.index("<svg") :]
+    text = re.sub(r' (?:d|x|y)="[^"]*"', lambda m: re.sub(r"(\.\d\d)\d+", r"\1", m[0]), text)
+    text = re.sub(r'style="[^"]*"', lambda m: _with_variables(m[0]), text)
+    head = text.index(">") + 1
+    return f"{text[:head]}<style>{_scheme()}</style>{text[head:]}"
+
+
+def _with_variables(style: str) -> str:
+    style = style.replace("'DejaVu Sans'", FONTS)
+    return re.sub(r"#[0-9a-f]{6}", lambda m: f"var(--c{m[0][1:]},{m[0]})" if m[0] in DARK else m[0], style)
+
+
+def _scheme() -> str:
+    dark = ";".join(f"--c{light[1:]}:{dark}" for light, dark in DARK.items())
+    return f"@media screen and (prefers-color-scheme:dark){{:root{{{dark}}}}}"
+
+
+def new_figure(height: float, width: float = WIDTH) -> Figure:
+    """An empty figure of the page's width, laid out without pyplot."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure as NewFigure
+    from matplotlib.layout_engine import ConstrainedLayoutEngine
+
+    layout = ConstrainedLayoutEngine(w_pad=0.06, h_pad=0.05, hspace=0.03, wspace=0.03)
+    figure = NewFigure(figsize=(width, height), layout=layout, dpi=96)
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def label(text: str, most: int = 28) -> str:
+    """A name from the data as it may stand in a picture: one short line of printable text."""
+    line = "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in text)
+    line = line if len(line) <= most else f"{line[: most - 1]}\N{HORIZONTAL ELLIPSIS}"
+    return f"\N{THIN SPACE}{line}" if line.startswith("_") else line  # matplotlib hides labels that begin with _
+
+
+def colour(i: int) -> str:
+    """The colour of the i-th sensor or component."""
+    return SERIES[i % len(SERIES)]
+
+
+def trace(axes: Axes, time: Array, values: Array, colour: str, columns: int = COLUMNS) -> Envelope:
+    """Draw a series so that every extreme shows, whatever its length; a darker line is the mean of each column."""
+    found = envelope(time, values, columns)
+    few = found.samples <= 300
+    dense = found.samples > 2 * columns
+    marker: dict[str, Any] = {"marker": "o", "markersize": 2.2, "markeredgewidth": 0} if few else {}
+    zigzag = found.zigzag if dense else (found.time, found.mean)
+    axes.plot(*zigzag, color=colour, linewidth=0.8, alpha=0.45 if dense else 0.9, **marker)
+    if dense:
+        axes.plot(found.time, found.mean, color=colour, linewidth=0.9)
+    return found
+
+
+def around(axes: Axes, values: Array, least: float = 0.0) -> None:
+    """Limits of the y axis that hold every finite value, at least `least` each side, symmetric about zero."""
+    known = values[np.isfinite(values)]
+    reach = max(float(np.abs(known).max()) if known.size else 0.0, least)
+    axes.set_ylim(*((-1.08 * reach, 1.08 * reach) if reach > 0 else (-1.0, 1.0)))
+
+
+def nothing(axes: Axes, words: str) -> None:
+    """Say in an empty panel why it is empty."""
+    axes.text(0.5, 0.5, words, transform=axes.transAxes, ha="center", va="center", color=MUTED)
+
+
+def legend(figure: Figure, handles: Sequence[Any], names: Sequence[str]) -> None:
+    """One legend above all panels."""
+    figure.legend(handles, [label(n) for n in names], loc="outside upper right", ncols=min(len(names), 8))
