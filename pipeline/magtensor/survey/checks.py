@@ -97,9 +97,9 @@ def resolution(values: Floats) -> float:
         return 0.0
     step = float(steps.min())
     while step > 1e-8 * largest:
-        # The shortest difference may be off by the rounding of two printed numbers; the mean of short ones is less.
-        short = steps[steps < 10.5 * step]
-        step = float(short.sum() / np.round(short / step).sum()) if len(short) else step
+        # The shortest difference may be off by the rounding of two printed numbers; the mean of its like is less.
+        alike = steps[np.abs(steps - step) < 0.02 * step]
+        step = float(alike.mean()) if len(alike) else step
         rest = np.abs(steps - np.round(steps / step) * step)
         off = rest > 0.02 * step
         if off.mean() <= 0.05:
