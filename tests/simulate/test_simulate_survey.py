@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -320,6 +321,16 @@ def test_start_is_utc_however_it_is_written() -> None:
         assert read_scenario(scenario(start=start)).start == "2026-03-21T08:00:00Z"
 
 
+def test_a_scenario_built_in_python_may_hold_times_and_arrays() -> None:
+    vector = np.array([1.0, 2.0, 3.0])
+    field = {"earth": {"vector_nT": 1e4 * vector}}
+    built = read_scenario(scenario(field=field, seed=np.int64(3), start=datetime(2026, 3, 21, 8, tzinfo=UTC)))
+    assert built.start == "2026-03-21T08:00:00Z" and built.seed == 3
+    np.testing.assert_array_equal(built.field.earth.vector(), 1e4 * vector)
+    with pytest.raises(UsageError, match="cannot stand in a scenario"):
+        read_scenario(scenario(field=vector.mean))
+
+
 def test_a_file_that_is_no_scenario(tmp_path: Path) -> None:
     for text in ("- 1\n", "a: [1\n", "!!python/object/apply:os.getcwd []\n"):
         (tmp_path / "bad.yaml").write_text(text)
@@ -348,3 +359,14 @@ def _models_in(annotation: Any) -> list[type[BaseModel]]:
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return [annotation]
     return [m for part in getattr(annotation, "__args__", ()) for m in _models_in(part)]
+
+
+def test_the_page_on_the_simulator_names_everything() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "simulator.md").read_text(encoding="utf-8")
+    schema = Scenario.model_json_schema()
+    words = set(schema["properties"])
+    words |= set(schema["properties"]["effects"]["items"]["discriminator"]["mapping"])
+    words |= set(schema["properties"]["motion"]["discriminator"]["mapping"])
+    words |= set(schema["properties"]["channels"]["additionalProperties"]["discriminator"]["mapping"])
+    assert len(words) > 50
+    assert [word for word in sorted(words) if f"`{word}`" not in page] == []

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import json
 import re
+from datetime import date
 from typing import Any, Literal
 
+import numpy as np
 from pydantic import Field, field_validator, model_validator
 
+from magtensor.errors import UsageError
 from magtensor.simulate.base_station import BaseStationSpec
 from magtensor.simulate.channels import ChannelSpec, units_of
 from magtensor.simulate.effects import AnyEffect
@@ -79,7 +83,7 @@ class Scenario(Spec):
 
 
 def read_scenario(mapping: dict[str, Any]) -> Scenario:
-    """Check a mapping, as a YAML file holds it.
+    """Check a mapping, as a YAML file holds it or as Python code builds it (times and numpy values allowed).
 
     Raises:
         UsageError: with every mistake on a line of its own: where, what, and the nearest known word.
@@ -87,8 +91,20 @@ def read_scenario(mapping: dict[str, Any]) -> Scenario:
     from magtensor.recipe.problems import Problems
     from magtensor.recipe.source import Document
 
-    problems = Problems(Document(mapping, "scenario"))
-    checked = problems.validated(Scenario, mapping, ())
+    try:
+        plain = json.loads(json.dumps(mapping, default=_plain))
+    except TypeError as error:
+        raise UsageError(f"scenario: {error}") from None
+    problems = Problems(Document(plain, "scenario"))
+    checked = problems.validated(Scenario, plain, ())
     problems.raise_if_any()
     assert checked is not None
     return checked
+
+
+def _plain(value: object) -> object:
+    if isinstance(value, date):
+        return value.isoformat()
+    if isinstance(value, np.generic | np.ndarray):
+        return value.tolist()
+    raise TypeError(f"{value!r} cannot stand in a scenario")
