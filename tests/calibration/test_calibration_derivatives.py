@@ -2,6 +2,8 @@
 
 import numpy as np
 import pytest
+from paper_setups import CHI_FIELD, chi_response, directions
+
 from magtensor.calibration import alignment
 from magtensor.calibration.covariance import scalar_influence, scalar_jacobian
 from magtensor.calibration.factors import embedding, factor, rotation_and_upper
@@ -9,7 +11,6 @@ from magtensor.calibration.parameters import CHI, LI, Convention, parameters, re
 from magtensor.calibration.quadric import design, design_derivative, ellipsoid_restricted, fit_ellipsoid
 from magtensor.calibration.rotation import from_vector, to_vector
 from magtensor.calibration.vector import affine_to_correction, compressed_jacobian, compressed_residual
-from paper_setups import CHI_FIELD, chi_response, directions
 
 VALUES = np.array([0.2, -0.3, 0.1, 1.2, 0.9, 0.8, 0.01, -0.02, 0.03, 0.4, -0.5, 0.6])
 

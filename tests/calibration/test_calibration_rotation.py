@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from paper_setups import turn_x, turn_y, turn_z
+
 from magtensor.calibration.rotation import (
     CHI_SEQUENCE,
     LI_SEQUENCE,
@@ -18,7 +20,6 @@ from magtensor.calibration.rotation import (
     sequence_derivatives,
     to_vector,
 )
-from paper_setups import turn_x, turn_y, turn_z
 
 ANGLE = st.floats(-3.1, 3.1)
 MIDDLE = st.floats(-1.56, 1.56)

@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
+from paper_setups import CHI_FIELD, CHI_PSI, CHI_SCALE, chi_response, cross_components, directions, rms
+
 from magtensor_methods import chi2017, eigen_square_root, procrustes
-from paper_setups import CHI_FIELD, CHI_SCALE, CHI_PSI, chi_response, cross_components, directions, rms
 
 TABLE_2_MATRIX = np.array(
     [
@@ -52,7 +53,7 @@ def test_table_2_without_noise() -> None:
 
 def test_psi_of_sensor_1_is_misprinted() -> None:
     """With the printed sign of psi the paper's own Table 2 cannot come out."""
-    from paper_setups import CHI_HARD, CHI_BIAS, CHI_PHI, CHI_SOFT, CHI_THETA, triangle
+    from paper_setups import CHI_BIAS, CHI_HARD, CHI_PHI, CHI_SOFT, CHI_THETA, triangle
 
     own = triangle(CHI_SCALE[0], CHI_PHI[0], CHI_THETA[0], -CHI_PSI[0])
     raw = (CHI_FIELD * directions(np.random.default_rng(2), 100)) @ (own @ (np.eye(3) + CHI_SOFT[0])).T

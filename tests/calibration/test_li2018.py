@@ -2,20 +2,6 @@
 
 import numpy as np
 import pytest
-from magtensor.calibration import alignment
-from magtensor.calibration.parameters import LI, array_parameters, sensor_parameters
-from magtensor.calibration.quadric import design
-from magtensor.calibration.rotation import angle_between
-from magtensor_methods import (
-    li2018,
-    li2018_linear,
-    li2018_lm,
-    procrustes,
-    yin2014,
-    yin2014_linear,
-    zhang2015,
-)
-from magtensor_methods.li2018 import nine_parameters
 from paper_setups import (
     LI_ALPHA,
     LI_BETA,
@@ -32,6 +18,21 @@ from paper_setups import (
     li_response,
     rms,
 )
+
+from magtensor.calibration import alignment
+from magtensor.calibration.parameters import LI, array_parameters, sensor_parameters
+from magtensor.calibration.quadric import design
+from magtensor.calibration.rotation import angle_between
+from magtensor_methods import (
+    li2018,
+    li2018_linear,
+    li2018_lm,
+    procrustes,
+    yin2014,
+    yin2014_linear,
+    zhang2015,
+)
+from magtensor_methods.li2018 import nine_parameters
 
 PRESET = np.column_stack([LI_THETA, LI_PHI, LI_PSI, LI_SCALE, LI_BIAS, LI_ALPHA, LI_BETA, LI_GAMMA])
 

@@ -157,18 +157,18 @@ def coverage(
         condition = _condition(attitude)
         scatter = _scatter(attitude, matrix, centre, raw, total_field)
         worst = float(np.hypot(scatter, _bias(matrix, centre / field, nearest.coefficients) * field))
-    cones = _empty_cones(directions)
+    thinned = directions[_distinct(directions, 0.02)]
     return Coverage(
         samples=len(raw),
-        distinct=len(np.unique(np.round(points / SAME_ATTITUDE), axis=0)),
+        distinct=len(_distinct(points, SAME_ATTITUDE)),
         condition_number=condition,
         distance=first * field,
         second_distance=second * field,
         required_distance=_required_ratio(len(raw)) * noise * field,
         worst_error=worst,
         accepted_error=worst_error * field,
-        empty_cones=cones,
-        unseen=_unseen(directions),
+        empty_cones=_empty_cones(thinned),
+        unseen=_unseen(thinned),
         still=tuple(a for a, spread in zip("xyz", np.ptp(points, axis=0), strict=True) if spread < SAME_ATTITUDE),
     )
 
@@ -235,6 +235,13 @@ def _bias(matrix: Array, offset: Array, nearest: Array) -> float:
     points = np.linalg.solve(matrix, _sphere().T).T + offset - other.offset
     squared = np.einsum("ni,ij,nj->n", points, other.shape, points)
     return float(np.max(np.abs(np.sqrt(squared) - 1.0)))
+
+
+def _distinct(points: Array, cell: float) -> np.ndarray:
+    """Indices of one point in each occupied cell of a grid, for points (N, 3) of order one."""
+    index = np.round((points - points.min(axis=0)) / cell).astype(np.int64)
+    size = index.max(axis=0) + 1
+    return np.unique((index[:, 0] * size[1] + index[:, 1]) * size[2] + index[:, 2], return_index=True)[1]
 
 
 def _directions(points: Array, centre: Array) -> Array:

@@ -89,6 +89,25 @@ def regress(x: Array, y: Array, robust: bool = False) -> Linear:
     return Linear(coefficients, noise, np.linalg.pinv(gram) / np.outer(scale, scale))
 
 
+def judged_regression(raw: Array, field: Array, robust: bool, worst_error: float) -> Linear:
+    """Regression of raw output on the known field, refused where it does not determine a correction.
+
+    Raises
+    ------
+    NotEnoughData: the field did not leave a plane, or too few samples.
+    DataError: an axis that does not respond to the field.
+    """
+    fit = regress(field, raw, robust)
+    require_spatial(field, fit.noise, worst_error)
+    values = np.linalg.svd(fit.coefficients[:3], compute_uv=False)
+    if values[-1] < 1e-3 * values[0]:
+        raise DataError(
+            "the raw output does not respond to the field in all three directions",
+            hint="look for a dead or a doubled axis",
+        )
+    return fit
+
+
 def linear_regression(raw: Array, field: Array, robust: bool, worst_error: float) -> SensorCalibration:
     """Correction to a known field by regression of the raw output on it.
 
@@ -104,10 +123,9 @@ def linear_regression(raw: Array, field: Array, robust: bool, worst_error: float
     DataError: an axis that does not respond to the field.
     """
     raw, field = checked_vectors(raw, field)
-    fit = regress(field, raw, robust)
-    require_spatial(field, fit.noise, worst_error)
+    fit = judged_regression(raw, field, robust, worst_error)
     c, offset = fit.coefficients[:3].T, fit.coefficients[3]
-    matrix = _inverse(c)
+    matrix: Array = np.asarray(np.linalg.inv(c), dtype=np.float64)
     # parameters (C row by row, o): row a has covariance noise^2 (Z'Z)^-1 over (its three elements, its offset)
     cov = np.zeros((12, 12))
     for a in range(3):
@@ -235,10 +253,10 @@ def li_vector_calibration(raw: Array, field: Array, worst_error: float) -> Senso
     Parameters and errors as in `linear_regression`; the noise is taken to be that of the raw output.
     """
     raw, field = checked_vectors(raw, field)
+    judged_regression(raw, field, False, worst_error)
     fit = levenberg_marquardt(raw, field)
     miss = field - (raw - fit.offset) @ fit.matrix.T
     calibrated = float(np.sqrt(np.sum(miss**2) / (3 * max(len(raw) - 4, 1))))
-    require_spatial(raw, calibrated, worst_error)
     noise = calibrated * np.sqrt(3 / np.sum(fit.matrix**2))
     cov = np.kron(fit.matrix @ fit.matrix.T * noise**2, fit.inverse)
     to_correction = affine_to_correction(fit.matrix, fit.offset)
@@ -280,17 +298,6 @@ def checked_vectors(raw: Array, field: Array) -> tuple[Array, Array]:
     if len(raw) < 5:
         raise NotEnoughData(f"{len(raw)} samples cannot determine twelve parameters and their errors")
     return raw, field
-
-
-def _inverse(c: Array) -> Array:
-    values = np.linalg.svd(c, compute_uv=False)
-    if values[-1] < 1e-3 * values[0]:
-        raise DataError(
-            "the raw output does not respond to the field in all three directions",
-            hint="look for a dead or a doubled axis",
-        )
-    out: Array = np.asarray(np.linalg.inv(c), dtype=np.float64)
-    return out
 
 
 def _calibration(
