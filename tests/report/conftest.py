@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+
 from magtensor import result
 from magtensor.calibrated import contrasts, corrected, stored
 from magtensor.calibration.noise import noise_std
@@ -113,7 +114,7 @@ def parameters(count: int, rng: np.random.Generator) -> dict[str, Any]:
     """Chi's parameters as a variable over (sensor, chi_parameter), with deviations."""
     names = ("phi", "theta", "psi", "k_x")
     units = {"phi": "rad", "theta": "rad", "psi": "rad", "k_x": "1"}
-    values = rng.normal(0.0, 0.01, (count, 4)) + [0, 0, 0, 1]
+    values = rng.normal(0.0, 0.01, (count, 4)) + np.array([0, 0, 0, 1])
     return {
         "calibration/chi_parameter": (("chi_parameter",), np.array(names), {"units_of_each": json.dumps(units)}),
         "calibration/chi": (("sensor", "chi_parameter"), values, {"long_name": "parameters of Chi 2017"}),

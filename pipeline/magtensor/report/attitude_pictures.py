@@ -34,9 +34,9 @@ def coverage(unit: Array, residual: Array | None, sensors: list[str]) -> Figure:
         residual: (N, S) nT, or None: then the directions alone.
         sensors: S names.
     """
-    across = 2 if len(sensors) > 1 else 1
+    across = 1 if len(sensors) == 1 else 2 if len(sensors) <= 4 else 3
     rows = -(-len(sensors) // across)
-    figure = new_figure(0.3 + 2.75 * rows)
+    figure = new_figure(0.3 + (1.85 if across == 3 else 2.7) * rows)
     grid = figure.subplots(rows, 2 * across, squeeze=False).ravel()
     dots = []
     for i, name in enumerate(sensors):

@@ -17,10 +17,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from magtensor.calibration.types import Array
-from magtensor.report.reduction import COLUMNS, Envelope, envelope
+from magtensor.report.reduction import COLUMNS, envelope
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.axis import Axis
     from matplotlib.figure import Figure
 
 # (light, dark); the light ones are told apart by readers who do not see red from green (Okabe and Ito)
@@ -32,6 +33,7 @@ DARK = {
     "#8a6d00": "#d9b945", "#3f96d4": "#9ad0fb", "#6b4fbb": "#b09cf5", "#707b86": "#b3bdc7",
 }  # fmt: skip
 FONTS = "system-ui,'Segoe UI','Helvetica Neue',Arial,'DejaVu Sans',sans-serif"
+MEANS_PER_COLUMN = 4  # a slow change shows better in fewer, quieter means
 WIDTH = 10.6  # inches, of a picture as wide as the page
 MOST_SENSORS = 12  # rows of a picture
 STYLE: dict[Any, Any] = {
@@ -72,15 +74,21 @@ def picture(title: str, caption: str, draw: Callable[[], Figure]) -> Picture:
 
 
 def svg(figure: Figure) -> str:
-    """A figure as SVG text: colours as CSS variables, the reader's own fonts, coordinates to a hundredth of a point."""
+    """A figure as SVG text: colours as CSS variables, the reader's own fonts, coordinates to a tenth of a point."""
     buffer = io.StringIO()
     figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
     text = buffer.getvalue()
     text = text[text.index("<svg") :]
-    text = re.sub(r' (?:d|x|y)="[^"]*"', lambda m: re.sub(r"(\.\d\d)\d+", r"\1", m[0]), text)
+    text = re.sub(r' (?:d|x|y)="[^"]*"', lambda m: _short(m[0]), text)
     text = re.sub(r'style="[^"]*"', lambda m: _with_variables(m[0]), text)
     head = text.index(">") + 1
     return f"{text[:head]}<style>{_scheme()}</style>{text[head:]}"
+
+
+def _short(coordinates: str) -> str:
+    """Path data to a tenth of a point, without the letters and blanks that SVG lets one leave out."""
+    coordinates = re.sub(r"(\.\d)\d+", r"\1", coordinates)
+    return re.sub(r"\s*\n(?:L )?", " ", coordinates).replace(".0 ", " ") if ' d="' in coordinates else coordinates
 
 
 def _with_variables(style: str) -> str:
@@ -117,17 +125,27 @@ def colour(i: int) -> str:
     return SERIES[i % len(SERIES)]
 
 
-def trace(axes: Axes, time: Array, values: Array, colour: str, columns: int = COLUMNS) -> Envelope:
-    """Draw a series so that every extreme shows, whatever its length; a darker line is the mean of each column."""
+def trace(
+    axes: Axes, time: Array, values: Array, colour: str, columns: int = COLUMNS, std: Array | None = None
+) -> None:
+    """Draw a series so that every extreme shows, whatever its length; where samples are many, a dark line of means.
+
+    `std` (N,): a band of one standard deviation each side of the line.
+    """
     found = envelope(time, values, columns)
-    few = found.samples <= 300
-    dense = found.samples > 2 * columns
-    marker: dict[str, Any] = {"marker": "o", "markersize": 2.2, "markeredgewidth": 0} if few else {}
-    zigzag = found.zigzag if dense else (found.time, found.mean)
-    axes.plot(*zigzag, color=colour, linewidth=0.8, alpha=0.45 if dense else 0.9, **marker)
-    if dense:
-        axes.plot(found.time, found.mean, color=colour, linewidth=0.9)
-    return found
+    many = found.samples > 2 * columns
+    look: dict[str, Any] = {"linewidth": 0.8, "alpha": 0.9}
+    if many:
+        axes.plot(*found.zigzag, color=colour, linewidth=0.8, alpha=0.38)
+        columns //= MEANS_PER_COLUMN
+        found, look = envelope(time, values, columns), {"linewidth": 1.1}
+    elif found.samples <= 300:
+        look |= {"marker": "o", "markersize": 2.2, "markeredgewidth": 0}
+    axes.plot(found.time, found.mean, color=colour, **look)
+    if std is not None:
+        # over the samples of `values`, so that both have the same columns
+        wide = envelope(time, np.where(np.isfinite(values), np.nan_to_num(std), np.nan), columns).mean
+        axes.fill_between(found.time, found.mean - wide, found.mean + wide, color=colour, alpha=0.3, linewidth=0)
 
 
 def around(axes: Axes, values: Array, least: float = 0.0) -> None:
@@ -135,6 +153,17 @@ def around(axes: Axes, values: Array, least: float = 0.0) -> None:
     known = values[np.isfinite(values)]
     reach = max(float(np.abs(known).max()) if known.size else 0.0, least)
     axes.set_ylim(*((-1.08 * reach, 1.08 * reach) if reach > 0 else (-1.0, 1.0)))
+
+
+def decades(axis: Axis) -> None:
+    """Tick labels of a logarithmic axis in plain text: powers of ten, and 2 and 5 between them where they are few."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    low, high = sorted(axis.get_view_interval())
+    between = (1.0, 2.0, 5.0) if high < 30 * low else (1.0,)
+    axis.set_major_locator(LogLocator(subs=between, numticks=12))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.3g}" if 1e-4 <= value < 1e5 else f"{value:.0e}"))
+    axis.set_minor_formatter(NullFormatter())
 
 
 def nothing(axes: Axes, words: str) -> None:

@@ -28,7 +28,7 @@ class Arrays:
     Attributes:
         sensors: names of the sensors shown; left_out: how many are not.
         residual, before: (N, S) nT; b, contrast: (N, S, 3) nT; None where the result has none.
-        noise: (S,) nT.
+        noise: (S,) nT of an axis of each sensor; contrast_noise: (S,) nT, what it makes of an axis of the contrast.
     """
 
     sensors: list[str]
@@ -38,6 +38,7 @@ class Arrays:
     b: Array | None
     contrast: Array | None
     noise: Array
+    contrast_noise: Array
 
 
 def arrays(content: Content) -> Arrays:
@@ -61,8 +62,15 @@ def arrays(content: Content) -> Arrays:
         [content.sensors[k] for k in keep],
         count - len(keep),
         noise=content.noise[keep],
+        contrast_noise=_contrast_noise(content.noise)[keep],
         **{name: None if v is None else v[:, keep] for name, v in found.items()},
     )
+
+
+def _contrast_noise(noise: Array) -> Array:
+    """(S,) nT of b_s - mean(b) for independent noise of (S,) nT: (1 - 2/S) of the own variance, and all over S^2."""
+    count = max(len(noise), 1)
+    return np.asarray(np.sqrt((1 - 2 / count) * noise**2 + np.sum(noise**2) / count**2)) if count > 1 else 0 * noise
 
 
 NO_TOTAL_FIELD = "The result holds no |b| − F: the survey has no total field, or nothing was calibrated against one."
@@ -108,11 +116,11 @@ def _residual_pictures(content: Content, use: Arrays) -> list[Picture | Gap]:
     if contrast is not None and len(use.sensors) > 1:
         caption = (
             "Each sensor's calibrated field less the mean of all, along x, y and z; zero in a uniform field. The band "
-            "is twice the sensor's own noise."
+            "is twice what the sensors' noise alone makes of it."
         )
         found.append(
             picture("Contrasts between the sensors", caption + _left_out(use), lambda: time_pictures.contrast(
-                time, units, contrast, use.noise, use.sensors
+                time, units, contrast, use.contrast_noise, use.sensors
             ))
         )  # fmt: skip
     return found
@@ -189,7 +197,9 @@ def _attitude_pictures(content: Content, use: Arrays) -> list[Picture | Gap]:
 def _noise_pictures(content: Content, use: Arrays) -> list[Picture | Gap]:
     found: list[Picture | Gap] = []
     title = "Spectrum of what is left"
-    curves = noise_pictures.curves(content.time, use.residual, use.contrast if len(use.sensors) > 1 else None)
+    curves = noise_pictures.curves(
+        content.time, use.residual, use.contrast if len(use.sensors) > 1 else None, use.noise, use.contrast_noise
+    )
     if use.residual is None and (use.contrast is None or len(use.sensors) < 2):
         found.append(Gap(title, NO_TOTAL_FIELD))
     elif not curves:
@@ -201,10 +211,8 @@ def _noise_pictures(content: Content, use: Arrays) -> list[Picture | Gap]:
         )
         step = float(np.median(np.diff(content.time)))
         found.append(
-            picture(title, caption + _left_out(use), lambda: noise_pictures.spectra(
-                curves, step, use.noise, use.sensors
-            ))
-        )  # fmt: skip
+            picture(title, caption + _left_out(use), lambda: noise_pictures.spectra(curves, step, use.sensors))
+        )
     residual = use.residual
     if residual is not None:
         caption = (

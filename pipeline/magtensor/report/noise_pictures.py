@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from magtensor.calibration.types import Array
-from magtensor.report.drawing import INK, MUTED, colour, label, legend, new_figure, nothing
+from magtensor.report.drawing import INK, MUTED, colour, decades, label, legend, new_figure, nothing
 from magtensor.report.reduction import Spectrum, spectrum, thinned
 
 if TYPE_CHECKING:
@@ -26,31 +26,36 @@ class Curves:
         words: what it is.
         summed: how many axes the power is summed over.
         of: a spectrum for each sensor; None where no stretch of it is long enough.
+        noise: (S,) nT of one axis, what noise alone would make of the quantity; NaN where unknown.
     """
 
     words: str
     summed: int
     of: list[Spectrum | None]
+    noise: Array
 
 
-def curves(time: Array, residual: Array | None, contrast: Array | None) -> list[Curves]:
+def curves(
+    time: Array, residual: Array | None, contrast: Array | None, noise: Array, contrast_noise: Array
+) -> list[Curves]:
     """The spectra of |b| - F and of the contrasts, as far as there is one.
 
     Args:
         time: (N,) s.
         residual: (N, S) nT, or None; contrast: (N, S, 3) nT, or None.
+        noise, contrast_noise: (S,) nT of one axis that noise alone gives each; NaN where unknown.
     """
     if len(time) < 2 or not np.median(np.diff(time)) > 0:
         return []
     found = []
-    for words, values in (
-        ("|b| − F", None if residual is None else residual[..., None]),
-        ("contrast between the sensors, all axes", contrast),
+    for words, values, level in (
+        ("|b| − F", None if residual is None else residual[..., None], noise),
+        ("contrast between the sensors, all axes", contrast, contrast_noise),
     ):
         if values is not None:
             each = [_summed([spectrum(time, column) for column in values[:, i].T]) for i in range(values.shape[1])]
             if any(s is not None for s in each):
-                found.append(Curves(words, values.shape[2], each))
+                found.append(Curves(words, values.shape[2], each, level))
     return found
 
 
@@ -63,20 +68,20 @@ def _summed(parts: list[Spectrum | None]) -> Spectrum | None:
     return Spectrum(known[0].frequency, density, known[0].averaged)
 
 
-def spectra(found: list[Curves], step: float, noise: Array, sensors: list[str]) -> Figure:
+def spectra(found: list[Curves], step: float, sensors: list[str]) -> Figure:
     """Amplitude spectra, with the level of each sensor's white noise.
 
     Args:
         found: from `curves`, not empty.
         step: s between samples.
-        noise: (S,) nT of each sensor, NaN where unknown.
+        sensors: S names.
     """
     from matplotlib.lines import Line2D
 
     figure = new_figure(3.3)
     panels = figure.subplots(1, len(found), squeeze=False)[0]
     for axes, shown in zip(panels, found, strict=True):
-        _spectrum_panel(axes, shown.of, noise * np.sqrt(2 * step * shown.summed))
+        _spectrum_panel(axes, shown.of, shown.noise * np.sqrt(2 * step * shown.summed))
         axes.set_title(shown.words)
         axes.set_xlabel("frequency  (Hz)")
     panels[0].set_ylabel("nT / √Hz")
@@ -95,6 +100,8 @@ def _spectrum_panel(axes: Axes, of: list[Spectrum | None], level: Array) -> None
         axes.plot(shown.frequency, np.where(shown.density > 0, shown.density, np.nan), color=colour(i), linewidth=1.0)
         if np.isfinite(level[i]) and level[i] > 0:
             axes.axhline(level[i], color=colour(i), linewidth=0.9, linestyle=(0, (4, 3)), alpha=0.8)
+    for axis in (axes.xaxis, axes.yaxis):
+        decades(axis)
 
 
 def histograms(residual: Array, sensors: list[str]) -> Figure:
@@ -135,5 +142,6 @@ def _histogram(axes: Axes, values: Array, i: int) -> None:
     axes.plot(x, normal, color=INK, linewidth=1.0)
     axes.set_yscale("log")
     axes.set_ylim(0.5, 2.5 * max(float(counts.max()), float(normal.max()), 1.0))
+    decades(axes.yaxis)
     if beyond := int(((known < edges[0]) | (known > edges[-1])).sum()):
         axes.text(0.98, 0.97, f"{beyond} beyond", transform=axes.transAxes, ha="right", va="top", color=MUTED)

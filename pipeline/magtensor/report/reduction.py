@@ -8,7 +8,7 @@ import numpy as np
 
 from magtensor.calibration.types import Array
 
-COLUMNS = 700  # about what a page resolves
+COLUMNS = 600  # about what a page resolves
 GAP = 5.0  # sampling intervals after which a line is broken
 
 

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from magtensor.accuracy import COMPONENTS
 from magtensor.calibrated import MATRIX_ENTRIES, OFFSET_ENTRIES
 from magtensor.report.clock import instant
 from magtensor.report.content import Content, decoded
@@ -62,7 +63,10 @@ def number(value: Any, digits: int = 4) -> str:
         mantissa, exponent = f"{value:.{digits - 1}e}".split("e")
         return f"{mantissa} × 10{str(int(exponent)).translate(SUPERSCRIPTS)}".replace("-", "−")
     # rounding may carry into the next power of ten, which then shows one digit too many: harmless
-    return f"{value:.{max(digits - 1 - power, 0)}f}".replace("-", "−")
+    text = f"{value:.{max(digits - 1 - power, 0)}f}"
+    if "." in text and float(text) == value:  # nothing was rounded: the zeros would claim a precision
+        text = text.rstrip("0").rstrip(".")
+    return text.replace("-", "−")
 
 
 def with_std(value: float, std: float) -> str:
@@ -89,6 +93,7 @@ def errors(content: Content) -> Table | None:
     columns = [*_raw_column(content), *_verdict_columns(content.outcome["error"])]
     if not any(block for _, block in columns):
         return None
+    columns += _noise_column(content)
     groups = []
     for key, heading, units in (
         ("total_field_rms_nT", "total field, rms of |b| − F", "nT"),
@@ -133,6 +138,23 @@ def _raw_column(content: Content) -> list[tuple[str, Mapping[str, Any]]]:
     figures = {s: _rms(before[known[:, i], i]) for i, s in enumerate(content.sensors)}
     samples = int(known.all(axis=1).sum())
     return [("raw output", {"total_field_rms_nT": figures | {"all": _rms(before[known])}, "samples": samples})]
+
+
+def _noise_column(content: Content) -> list[tuple[str, Mapping[str, Any]]]:
+    """What the sensors' white noise alone would give: no calibration can do better."""
+    noise, gain = content.variable("calibration/noise_std"), content.variable("calibration/tensor_gain")
+    if noise is None or not np.isfinite(noise).all():
+        return []
+    each = content.noise
+    block: dict[str, Any] = {
+        "total_field_rms_nT": dict(zip(content.sensors, each, strict=True)) | {"all": _rms(each)},
+    }
+    if gain is not None:
+        of = np.sqrt(np.einsum("rcsa,sa->rc", gain**2, noise**2))
+        block["tensor_rms_nT_per_m"] = {
+            name: of["xyz".index(name[0]), "xyz".index(name[1])] for name in COMPONENTS
+        } | {"all": _rms(of)}
+    return [("noise alone", block)]
 
 
 def _rms(values: np.ndarray) -> float:

@@ -10,7 +10,7 @@ from magtensor.accuracy import COMPONENTS
 from magtensor.calibration.types import Array
 from magtensor.report.clock import Clock, clock
 from magtensor.report.drawing import INK, MUTED, WASH, around, colour, label, legend, new_figure, nothing, trace
-from magtensor.report.reduction import envelope
+from magtensor.report.reduction import COLUMNS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -45,6 +45,8 @@ def total_field_residual(
         main.set_ylabel("|b| − F  (nT)")
         small.set_title("before")
         small.yaxis.tick_right()
+        small.spines["right"].set_visible(True)
+        small.spines["left"].set_visible(False)
         if before is None or not np.isfinite(before[:, i]).any():
             nothing(small, "not stored")
         else:
@@ -59,7 +61,7 @@ def contrast(time: Array, units: str, values: Array, noise: Array, sensors: list
 
     Args:
         values: (N, S, 3) nT, NaN where not in use.
-        noise: (S,) nT of each sensor's own noise.
+        noise: (S,) nT what noise alone makes of each contrast.
     """
     figure = new_figure(0.6 + 1.15 * len(sensors))
     panels = figure.subplots(len(sensors), 1, squeeze=False, sharex=True)[:, 0]
@@ -147,13 +149,7 @@ def reference(time: Array, units: str, total_field: Array | None, diurnal: Array
 
 
 def _with_band(axes: Axes, axis: Clock, values: Array, std: Array | None, paint: str) -> None:
-    found = trace(axes, axis.values, values, paint)
-    if std is not None:
-        # over the samples of `values`, so that both have the same columns
-        spread = envelope(axis.values, np.where(np.isfinite(values), np.nan_to_num(std), np.nan)).mean
-        axes.fill_between(
-            found.time, found.mean - spread, found.mean + spread, color=paint, alpha=0.22, linewidth=0, zorder=1
-        )
+    trace(axes, axis.values, values, paint, COLUMNS // 2, std)
     axes.axhline(0.0, color=INK, linewidth=0.5)
 
 
