@@ -238,6 +238,37 @@ def test_nonlinearity_at_full_scale() -> None:
     settings = {"nT_at_full_scale": [1.0, 1.0, 1.0], "difference_ratio": 0.0}
     cross, _ = added("cross_field", settings, field=earth, motion=still)
     np.testing.assert_allclose(cross[0, 0], [0.0, -0.48, 0.0], atol=1e-12)
+    both, _ = added("cross_field", settings | {"difference_ratio": 0.5}, field=earth, motion=still)
+    np.testing.assert_allclose(both[0, 0], [-0.32, -0.48 + 0.14, 0.18], atol=1e-12)
+
+
+def test_offsets_and_scales_follow_their_channels() -> None:
+    ramp = {"type": "ramp", "start": 3.0, "per_h": 60.0, "units": "hPa"}
+    response = {"channel": "pressure", "reference": 3.0, "nT_per_unit": [2.0, 0.0, -1.0], "power": 2}
+    course = (np.arange(600) / 600.0) ** 2
+    offset, survey = added("channel_response", response, channels={"pressure": ramp})
+    np.testing.assert_allclose(offset[:, 3], course[:, None] * [2.0, 0.0, -1.0], atol=1e-12)
+    scale, _ = added("channel_response", response | {"times_field": True}, channels={"pressure": ramp})
+    np.testing.assert_allclose(scale[:, 3], 1e-6 * offset[:, 3] * survey.truth.b[:, 3], atol=1e-12)
+    warming = {
+        "temperature": {"type": "temperature", "ambient_degC": 20.0, "trend_degC_per_h": 60.0, "tau_s": 0.0}
+    }
+    settings = {"ppm_per_degC": [20.0, 20.0, 20.0], "reference_degC": 20.0}
+    gain, survey = added("temperature_scale", settings, channels=warming)
+    np.testing.assert_allclose(gain[-1, 2], 20e-6 * 599 / 600 * survey.truth.b[-1, 2], rtol=1e-6)
+    battery = {"supply_voltage": {"type": "supply", "voltage_V": 12.0, "discharge_V_per_h": 60.0}}
+    sag, _ = added("supply_offset", {"nT_per_V": [5.0, 0.0, 0.0], "reference_V": 12.0}, channels=battery)
+    np.testing.assert_allclose(sag[:, 0, 0], -5.0 * np.arange(600) / 600)
+    droop, _ = added("supply_scale", {"ppm_per_V": [1.0, 1.0, 1.0], "reference_V": 12.0}, channels=battery)
+    np.testing.assert_allclose(droop[300, 1], -0.5e-6 * survey.truth.b[300, 1])
+
+
+def test_a_latent_source_is_one_waveform_times_a_vector_at_each_sensor() -> None:
+    settings = {"rms_nT": 1.0, "waveform_of": {"type": "smooth", "time_s": 3.0}}
+    waveform, survey = added("latent_source", settings)
+    _, size, _ = np.linalg.svd(waveform.reshape(600, 12), full_matrices=False)
+    assert size[1] < 1e-12 * size[0]
+    assert survey.channels == {}
 
 
 def test_temperature_of_a_body_after_a_step() -> None:
