@@ -6,8 +6,9 @@ reading here: with response C = I + E, E upper triangular and of first order lik
 
     |m|^2 - F^2 = 2 m^T (E m + o),        b = (I - E) (m - o).
 
-Scale errors, angles and offsets all count as small. It returns Li's printed 1003.92, 927.04, 827.88, 690.39 nT to
-0.1 nT, so the reading is right in effect if not in notation.
+Scale errors, angles and offsets all count as small. Of the seventeen readings tried this one alone returns Li's
+printed 1003.92, 927.04, 827.88, 690.39 nT, to 0.01 nT; it has no constant to adjust, so it is right in effect if not
+in notation.
 """
 
 from __future__ import annotations
