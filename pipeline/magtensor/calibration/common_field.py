@@ -85,6 +85,15 @@ def common_field(raw: Array, noise: Array | None = None, keep: Array | None = No
     return CommonField(sd, _handed(basis), mean / sd, count, chi2)
 
 
+def output_noise(raw: Array) -> Array:
+    """White noise (S, 3) nT of every output, from what second differences in time have in common and have not.
+
+    Second differences (over sqrt 6) of the outputs share a plane as the outputs do, and hold nothing slower than a
+    few samples: slow effects that no model knows yet cannot pass for noise. Needs at least two sensors.
+    """
+    return common_field(np.diff(raw, n=2, axis=0) / np.sqrt(6.0)).noise.reshape(raw.shape[1], 3)
+
+
 def _handed(basis: Array) -> Array:
     """The same plane with the coordinates as right-handed as most sensors are."""
     determinants = np.linalg.det(basis.reshape(-1, 3, 3))

@@ -16,7 +16,7 @@ import numpy as np
 
 from magtensor.errors import NotEnoughData
 
-from .common_field import CommonField, common_field
+from .common_field import CommonField, common_field, output_noise
 from .coverage import WORST_ERROR, coverage, require_coverage
 from .maximum_likelihood import ScalarFit, fit_scalar
 from .types import Array, ArrayCalibration
@@ -58,7 +58,7 @@ def fit_joint(
     ----------
     raw: (N, S, 3) nT, finite.
     total_field: (N,) nT, positive.
-    noise: (S, 3) nT of the raw outputs; estimated from the data when None.
+    noise: (S, 3) nT of the raw outputs; when None that of second differences, with few samples of the residual.
     reference_noise: nT, white, of the total field.
     robust: leave out samples that no noise explains.
     worst_error: see `coverage.coverage`.
@@ -69,7 +69,7 @@ def fit_joint(
     """
     keep = np.ones(len(raw), dtype=bool)
     sensors = raw.shape[1]
-    given = noise
+    given = output_noise(raw) if noise is None and sensors > 1 and len(raw) >= LEAST_FOR_REJECTION else noise
     for _ in range(20):
         plane = common_field(raw, given, keep)
         y = plane.coordinates(raw)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,6 +54,10 @@ class Terms:
         np.add.at(weights, self.part_series[own], coefficients[self.part_term[own]])
         out: Array = self.series @ weights
         return out
+
+    def at(self, samples: NDArray[np.int_]) -> Terms:
+        """The same at some of the samples."""
+        return replace(self, series=self.series[samples])
 
     def only(self, keep: Iterable[int]) -> Terms:
         """The terms of these numbers, in this order."""

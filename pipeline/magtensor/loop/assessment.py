@@ -1,0 +1,116 @@
+"""How strongly the data want a set of terms: coefficients, significance, held-out gain, in noise of its own colour."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from magtensor.calibration.types import Array
+from magtensor.loop.colour import Colour, colour_of
+from magtensor.loop.evidence import Grams, grams, normal
+from magtensor.loop.residual import Residual, taken_off
+from magtensor.loop.statistics import Estimate, Gain, held_out_gain, own_information, solve, wald_p
+from magtensor.loop.terms import Terms
+
+FINEST_BLOCKS = 120
+LEAST_PER_BLOCK = 4
+_ROUNDS = 3  # the colour depends on the coefficients and they on it; after three nothing moves
+
+
+@dataclass(frozen=True)
+class Colours:
+    """The colours of the two parts of a residual."""
+
+    across: Colour
+    along: Colour
+
+
+def colours_of(residual: Residual) -> Colours:
+    """Fit both."""
+    white = Colour(None, 1.0)
+    size = len(residual.noise)
+    across = colour_of(residual.across, size - 3) if residual.across is not None else white
+    along = colour_of(residual.along[:, None]) if residual.along is not None else white
+    return Colours(across, along)
+
+
+@dataclass(frozen=True)
+class Assessment:
+    """What the data say of terms.
+
+    Attributes:
+        estimate: coefficients, covariance (in noise of the fitted colour), information.
+        gain: on held-out blocks.
+        p: that all coefficients are zero.
+        grams: the blocks, for further questions.
+        colours: under the hypothesis that the terms are real.
+    """
+
+    estimate: Estimate
+    gain: Gain
+    p: float
+    grams: Grams
+    colours: Colours
+
+
+def block_count(samples: int) -> int:
+    """Blocks for a survey of so many samples."""
+    return int(np.clip(samples // LEAST_PER_BLOCK, 1, FINEST_BLOCKS))
+
+
+def assess(residual: Residual, terms: Terms, colours: Colours, *, significance: bool = True) -> Assessment:
+    """Assess terms that no model holds yet.
+
+    The noise is what is left when the terms have explained their part: colour estimated from a residual that still
+    holds a strong effect would call the effect noise.
+
+    Parameters
+    ----------
+    residual: of the current model.
+    terms: with the residual's samples as rows.
+    colours: of the residual, to start from.
+    significance: also compute the p value, the dearest part.
+    """
+    for _ in range(_ROUNDS):
+        estimate = estimated(residual, terms, colours)
+        after = colours_of(taken_off(residual, terms, estimate.theta))
+        if _alike(after, colours):
+            colours = after
+            break
+        colours = after
+    blocks = grams(residual, terms, colours.across, colours.along, block_count(len(residual.affine)))
+    n, y = normal(blocks.total())
+    estimate = solve(n[0], y[0], own_information(blocks))
+    gain = held_out_gain(blocks, residual.freedom)
+    return Assessment(estimate, gain, wald_p(blocks) if significance else float("nan"), blocks, colours)
+
+
+def estimated(residual: Residual, terms: Terms, colours: Colours) -> Estimate:
+    """Coefficients in noise of given colours."""
+    whole = grams(residual, terms, colours.across, colours.along)
+    n, y = normal(whole)
+    return solve(n[0], y[0], own_information(whole))
+
+
+def explained(estimate: Estimate) -> float:
+    """Reduction of the sum of squares in the sample, in noise of unit variance."""
+    out: float = float(estimate.theta @ estimate.normal @ estimate.theta)
+    return out
+
+
+def _alike(a: Colours, b: Colours) -> bool:
+    return all(
+        np.isclose(x.white, y.white, rtol=1e-3) and _lowest(x) < 1.1 * _lowest(y) and _lowest(y) < 1.1 * _lowest(x)
+        for x, y in ((a.across, b.across), (a.along, b.along))
+    )
+
+
+def _lowest(colour: Colour) -> float:
+    return 1.0 if colour.power is None else float(colour.power[0])
+
+
+def contribution_rms(terms: Terms, theta: Array, outputs: int) -> Array:
+    """(outputs,) nT rms that terms add to each raw output, their mean taken off (an offset would hold it)."""
+    out: Array = terms.contribution(theta, outputs).std(axis=0)
+    return out

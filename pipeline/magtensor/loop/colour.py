@@ -1,0 +1,99 @@
+"""The colour of the noise: white plus a sum of slow processes, and the filter that makes it white.
+
+Fluxgates have 1/f noise. Whatever treats it as white sees drifts, temperature effects and steps where there are
+none (METHODS A2 step 1). The spectrum of the residual is fitted by a white level and relaxation processes of
+decade time constants with non-negative weights; the filter divides by its square root in the cosine transform,
+which keeps trends from leaking round the ends.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from magtensor.calibration.types import Array
+
+_COLUMNS = 16  # filtered at a time
+
+
+@dataclass(frozen=True)
+class Colour:
+    """A power spectrum over the N cosine frequencies, relative to its white level.
+
+    Attributes:
+        power: (N,), at least 1; None for white noise.
+        white: the white level, in the units of the squared residual.
+    """
+
+    power: Array | None
+    white: float
+
+    def whiten(self, series: Array) -> Array:
+        """Filter (N,) or (N, K) so that noise of this colour becomes white with unit variance."""
+        scale = 1.0 / np.sqrt(self.white)
+        if self.power is None:
+            return series * scale
+        from scipy.fft import dct, idct
+
+        columns = series.reshape(len(series), -1)
+        out = np.empty_like(columns)
+        weight = (scale / np.sqrt(self.power))[:, None]
+        for start in range(0, columns.shape[1], _COLUMNS):
+            part = slice(start, start + _COLUMNS)
+            out[:, part] = idct(dct(columns[:, part], axis=0, norm="ortho") * weight, axis=0, norm="ortho")
+        return out.reshape(series.shape)
+
+
+def colour_of(series: Array, freedom: float | None = None) -> Colour:
+    """Fit white noise plus relaxation processes to the mean spectrum of the columns of (N, K).
+
+    Parameters
+    ----------
+    series: residuals.
+    freedom: how many independent values a row holds; K if None.
+    """
+    from scipy.fft import dct
+    from scipy.optimize import nnls
+
+    columns = series.reshape(len(series), -1)
+    n, k = columns.shape
+    share = (freedom or k) / k
+    if n < 64:
+        return Colour(None, max(float(np.mean(columns**2)) / share, 1e-300))
+    power = np.zeros(n)
+    for start in range(0, k, _COLUMNS):
+        power += np.sum(dct(columns[:, start : start + _COLUMNS], axis=0, norm="ortho") ** 2, axis=1)
+    power /= k * share
+    power = power[1:]
+    frequency = np.arange(1, n) / (2.0 * n)  # cycles per sample
+    edges = np.unique(np.round(np.geomspace(1, n, min(60, n // 4))).astype(int))
+    level = np.array([power[a - 1 : b - 1].mean() for a, b in zip(edges[:-1], edges[1:], strict=True)])
+    centre = np.array([frequency[a - 1 : b - 1].mean() for a, b in zip(edges[:-1], edges[1:], strict=True)])
+    count = np.diff(edges) * k * share
+    taus = np.geomspace(2.0, 10.0 * n, 3 * max(2, int(np.log10(n))))
+    shapes = np.column_stack([np.ones_like(centre), *[_relaxation(centre, t) for t in taus]])
+    # chi-square weights from the fitted level itself: two rounds settle them
+    model = level
+    for _ in range(4):
+        weight = np.sqrt(count / 2.0) / np.maximum(model, 1e-300)
+        found, _ = nnls(shapes * weight[:, None], level * weight)
+        model = shapes @ found
+        if not model.min() > 0:
+            model = np.maximum(model, 1e-12 * level.max())
+    white = found[0]
+    if white <= 0:
+        white = float(np.min(model))
+    every = np.concatenate([[frequency[0] / 2], frequency])
+    total = white + sum((a * _relaxation(every, t) for a, t in zip(found[1:], taus, strict=True)), np.zeros(n))
+    relative = np.maximum(total / white, 1.0)
+    if relative[1] < 1.05:
+        return Colour(None, white)
+    return Colour(relative, white)
+
+
+def _relaxation(frequency: Array, tau: float) -> Array:
+    """Spectrum of a first-order process of time constant tau (in samples), 1 at zero frequency."""
+    decay = np.exp(-1.0 / tau)
+    out: Array = (1 - decay) ** 2 / (1 - 2 * decay * np.cos(2 * np.pi * frequency) + decay**2)
+    return out

@@ -1,0 +1,199 @@
+"""Evidence for regressors: block Gram matrices, from which every statistic follows without another pass.
+
+Across the plane the fit's own freedom is (b, 1) in every direction, so two regressors that act on outputs i and j
+with series d and e share Q_ij (d - P d) . (e - P e), P the projection on (b, 1): one small Gram of distinct series
+serves every output. Along the field the regressors are products with the gain, a plain Gram.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magtensor.calibration.types import Array
+from magtensor.loop.colour import Colour
+from magtensor.loop.residual import Residual
+from magtensor.loop.terms import REFERENCE, Terms
+
+IDENTIFIABLE = 1e-6  # of a regressor's own information: less than this is left after the fit's own freedom
+_INNER_RANK = 1e-9
+
+
+@dataclass(frozen=True)
+class Grams:
+    """Sums over each of B blocks.
+
+    Attributes:
+        zz, zd, dd: (B, 4, 4), (B, 4, K), (B, K, K) of the affine functions z and the series d, whitened.
+        ze, de: (B, 4, 3 S), (B, K, 3 S) with the residual across.
+        ee: (B,) square of the residual across.
+        aa, ar: (B, 12 + P, 12 + P), (B, 12 + P) of the columns along and with the residual along.
+        rr: (B,) square of the residual along.
+        samples: (B,) how many samples a block holds.
+        part_term, part_output, part_series, count: of the terms.
+        projector: (3 S, 3 S); noise: (3 S,) nT, of the residual.
+    """
+
+    zz: Array
+    zd: Array
+    dd: Array
+    ze: Array
+    de: Array
+    ee: Array
+    aa: Array
+    ar: Array
+    rr: Array
+    samples: Array
+    part_term: NDArray[np.int_]
+    part_output: NDArray[np.int_]
+    part_series: NDArray[np.int_]
+    count: int
+    projector: Array
+    noise: Array
+
+    def merged(self, blocks: int) -> Grams:
+        """The same in fewer, longer blocks of consecutive ones."""
+        starts = np.linspace(0, len(self.zz), blocks, endpoint=False).round().astype(int)
+        return self._with(lambda a: np.add.reduceat(a, starts, axis=0))
+
+    def total(self) -> Grams:
+        """All blocks as one."""
+        return self._with(lambda a: a.sum(axis=0, keepdims=True))
+
+    def without_each(self) -> Grams:
+        """For each block, the sum of all others."""
+        return self._with(lambda a: a.sum(axis=0, keepdims=True) - a)
+
+    def chosen(self, masks: Array) -> Grams:
+        """For each row of masks (R, B), the sum of the blocks it marks."""
+        return self._with(lambda a: np.tensordot(masks.astype(float), a, axes=1))
+
+    def _with(self, f: Callable[[Array], Array]) -> Grams:
+        return Grams(
+            f(self.zz), f(self.zd), f(self.dd), f(self.ze), f(self.de), f(self.ee), f(self.aa), f(self.ar), f(self.rr),
+            f(self.samples), self.part_term, self.part_output, self.part_series, self.count, self.projector, self.noise,
+        )  # fmt: skip
+
+
+def grams(residual: Residual, terms: Terms, across: Colour, along: Colour, blocks: int = 1) -> Grams:
+    """Gram matrices of terms evaluated at the residual's samples, in contiguous blocks.
+
+    Parameters
+    ----------
+    terms: their series have the residual's samples as rows.
+    across, along: the colours of the two parts of the residual.
+    """
+    n, size = len(residual.affine), len(residual.noise)
+    edges = np.linspace(0, n, blocks + 1).round().astype(int)
+    pieces = list(zip(edges[:-1], edges[1:], strict=True))
+    k, p = terms.series.shape[1], terms.count
+    raw = terms.part_output != REFERENCE
+    zz, zd, dd = np.zeros((blocks, 4, 4)), np.zeros((blocks, 4, k)), np.zeros((blocks, k, k))
+    ze, de, ee = np.zeros((blocks, 4, size)), np.zeros((blocks, k, size)), np.zeros(blocks)
+    if residual.across is not None and raw.any():
+        z, d, e = across.whiten(residual.affine), across.whiten(terms.series), across.whiten(residual.across)
+        for i, (a, b) in enumerate(pieces):
+            zz[i], zd[i], dd[i] = z[a:b].T @ z[a:b], z[a:b].T @ d[a:b], d[a:b].T @ d[a:b]
+            ze[i], de[i], ee[i] = z[a:b].T @ e[a:b], d[a:b].T @ e[a:b], np.sum(e[a:b] ** 2)
+    elif residual.across is not None:
+        e = across.whiten(residual.across)
+        z = across.whiten(residual.affine)
+        for i, (a, b) in enumerate(pieces):
+            zz[i], ze[i], ee[i] = z[a:b].T @ z[a:b], z[a:b].T @ e[a:b], np.sum(e[a:b] ** 2)
+    aa, ar, rr = np.zeros((blocks, 12 + p, 12 + p)), np.zeros((blocks, 12 + p)), np.zeros(blocks)
+    if residual.along is not None:
+        columns = np.zeros((n, 12 + p))
+        columns[:, :12] = residual.inner
+        columns[:, 12:] = _along(residual, terms)
+        columns, r = along.whiten(columns), along.whiten(residual.along)
+        for i, (a, b) in enumerate(pieces):
+            aa[i], ar[i], rr[i] = columns[a:b].T @ columns[a:b], columns[a:b].T @ r[a:b], r[a:b] @ r[a:b]
+    samples = np.diff(edges).astype(float)
+    return Grams(
+        zz, zd, dd, ze, de, ee, aa, ar, rr, samples,
+        terms.part_term, terms.part_output, terms.part_series, p, residual.projector, residual.noise,
+    )  # fmt: skip
+
+
+def _along(residual: Residual, terms: Terms) -> Array:
+    """(N, P): each term's column along the field."""
+    columns = np.zeros((len(residual.affine), terms.count))
+    gain = residual.gain / residual.noise
+    for t, o, s in zip(terms.part_term, terms.part_output, terms.part_series, strict=True):
+        weight = residual.reference_gain if o == REFERENCE else gain[:, o]
+        columns[:, t] += weight * terms.series[:, s]
+    return columns
+
+
+def normal(g: Grams) -> tuple[Array, Array]:
+    """Normal matrix (B, P, P) and right side (B, P) of the terms for each set, the fit's own freedom projected off."""
+    batch = len(g.zz)
+    n = np.zeros((batch, g.count, g.count))
+    y = np.zeros((batch, g.count))
+    raw = g.part_output != REFERENCE
+    if raw.any() and g.zz.any():
+        solve = np.linalg.solve(g.zz, np.concatenate([g.zd, g.ze], axis=2))
+        k = g.dd.shape[1]
+        t = g.dd - np.swapaxes(g.zd, 1, 2) @ solve[:, :, :k]
+        c = g.de - np.swapaxes(g.zd, 1, 2) @ solve[:, :, k:]
+        o, s = g.part_output[raw], g.part_series[raw]
+        parts = t[:, s[:, None], s[None, :]] * g.projector[o[:, None], o[None, :]]
+        into = _incidence(g)
+        n += into @ parts @ into.T
+        y += c[:, s, o] @ into.T
+    if g.aa.any():
+        own = np.linalg.pinv(g.aa[:, :12, :12], rcond=_INNER_RANK, hermitian=True)
+        mixed = g.aa[:, :12, 12:]
+        turned = np.swapaxes(mixed, 1, 2) @ own
+        n += g.aa[:, 12:, 12:] - turned @ mixed
+        y += g.ar[:, 12:] - (turned @ g.ar[:, :12, None])[:, :, 0]
+    return n, y
+
+
+def _incidence(g: Grams) -> Array:
+    """(P, parts on raw outputs): 1 / noise of the output where the part belongs to the term."""
+    raw = np.flatnonzero(g.part_output != REFERENCE)
+    into = np.zeros((g.count, len(raw)))
+    into[g.part_term[raw], np.arange(len(raw))] = 1.0 / g.noise[g.part_output[raw]]
+    return into
+
+
+def held_out(train: Grams, test: Grams, theta: Array, blocked: Array | None = None) -> tuple[Array, Array]:
+    """Sum of squared residuals of each test set, without and with the terms.
+
+    The fit's own freedom is fitted anew on each training set, with the terms held at theta (their residual is what
+    it is fitted to).
+
+    Parameters
+    ----------
+    train, test: R sets each.
+    theta: (R, P) coefficients from the training sets; those of `blocked` (P,) count in both cases.
+    """
+    zero = np.zeros_like(theta) if blocked is None else np.where(blocked, theta, 0.0)
+    return _loss(train, test, zero), _loss(train, test, theta)
+
+
+def _loss(train: Grams, test: Grams, theta: Array) -> Array:
+    batch = len(theta)
+    loss = np.zeros(batch)
+    if train.zz.any():
+        k, size = train.dd.shape[1], len(train.noise)
+        raw = np.flatnonzero(train.part_output != REFERENCE)
+        w = np.zeros((batch, k, size))
+        for j in raw:
+            o = train.part_output[j]
+            w[:, train.part_series[j], o] += theta[:, train.part_term[j]] / train.noise[o]
+        w = w @ train.projector
+        own = np.linalg.solve(train.zz, train.ze - train.zd @ w)
+        loss += test.ee + np.einsum("bij,bik,bkj->b", own, test.zz, own) + np.einsum("bij,bik,bkj->b", w, test.dd, w)
+        loss += 2 * np.einsum("bij,bik,bkj->b", own, test.zd, w)
+        loss -= 2 * (np.einsum("bij,bij->b", own, test.ze) + np.einsum("bij,bij->b", w, test.de))
+    if train.aa.any():
+        inverse = np.linalg.pinv(train.aa[:, :12, :12], rcond=_INNER_RANK, hermitian=True)
+        right = train.ar[:, :12] - np.einsum("bij,bj->bi", train.aa[:, :12, 12:], theta)
+        full = np.concatenate([np.einsum("bij,bj->bi", inverse, right), theta], axis=1)
+        loss += test.rr - 2 * np.einsum("bi,bi->b", full, test.ar) + np.einsum("bi,bij,bj->b", full, test.aa, full)
+    return loss

@@ -1,0 +1,208 @@
+"""Significance that autocorrelation cannot fake, and held-out gain: the two gates of METHODS A2 steps 3 to 5."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magtensor.calibration.types import Array
+from magtensor.loop.evidence import Grams, held_out, normal
+
+IDENTIFIABLE = 1e-6  # of a regressor's own information: a direction with less left is not estimated
+BLOCK_COUNTS = (100, 30, 12)  # long blocks protect against correlation longer than a short block
+FOLDS = 10
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Coefficients and what is known of them.
+
+    Attributes:
+        theta: (P,) in the units of the terms; minimum norm where directions are not identifiable.
+        covariance: (P, P).
+        normal: (P, P), the information, the fit's own freedom projected off.
+        rank: identifiable directions.
+    """
+
+    theta: Array
+    covariance: Array
+    normal: Array
+    rank: int
+
+
+def solve(n: Array, y: Array, scale: Array) -> Estimate:
+    """Least squares in the identifiable directions of one normal matrix.
+
+    Parameters
+    ----------
+    n: (P, P), y: (P,).
+    scale: (P,) information of each regressor before the fit's own freedom was projected off.
+    """
+    basis, values = _directions(n, scale)
+    inverse = basis / values @ basis.T
+    return Estimate(inverse @ y, inverse, n, basis.shape[1])
+
+
+def _directions(n: Array, scale: Array) -> tuple[Array, Array]:
+    """Identifiable directions (P, p) and their information (p,), in scaled coordinates undone again."""
+    root = np.sqrt(np.maximum(scale, 1e-300))
+    values, vectors = np.linalg.eigh(n / np.outer(root, root))
+    seen = values > IDENTIFIABLE
+    return vectors[:, seen] / root[:, None], values[seen]
+
+
+def own_information(g: Grams) -> Array:
+    """(P,) the information each regressor would have if the fit had no freedom of its own, constants left out."""
+    total = g.total()
+    out = np.zeros(g.count)
+    raw = g.part_output >= 0
+    if raw.any() and g.zz.any():
+        dd = np.diagonal(total.dd[0])
+        constant = total.zd[0, 3] ** 2 / max(total.zz[0, 3, 3], 1e-300)
+        size = np.maximum(dd - constant, 1e-12 * dd)
+        o = g.part_output[raw]
+        np.add.at(out, g.part_term[raw], size[g.part_series[raw]] * g.projector[o, o] / g.noise[o] ** 2)
+    if g.aa.any():
+        out += np.diagonal(total.aa[0])[12:]
+    return out
+
+
+def wald_p(g: Grams, subset: Sequence[int] | None = None) -> float:
+    """P value that the subset's coefficients (all if None) are zero, the others being free.
+
+    Delete-one-block jackknife covariance (CR3) of the coefficients, Hotelling's F, for several block lengths, the
+    largest p taken. A family with more identifiable directions than a third of the blocks cannot be tested at that
+    block count; if none is left, p is 1.
+
+    Parameters
+    ----------
+    g: the finest blocks.
+    """
+    from scipy.stats import f as f_distribution
+
+    full_n, full_y = normal(g.total())
+    scale = own_information(g)
+    chosen = np.arange(g.count) if subset is None else np.asarray(subset, dtype=int)
+    reduced_n, reduced_y = _without_others(full_n, full_y, chosen, scale)
+    basis, _ = _directions(reduced_n[0], scale[chosen])
+    p = basis.shape[1]
+    if p == 0:
+        return 1.0
+    theta = np.linalg.solve(basis.T @ reduced_n[0] @ basis, basis.T @ reduced_y[0])
+    worst = 0.0
+    tried = False
+    finest = len(g.zz)
+    for count in sorted({min(c, finest) for c in BLOCK_COUNTS}, reverse=True):
+        if count < 3 * p or count < 6:
+            continue
+        part = g if count == finest else g.merged(count)
+        n, y = normal(part.without_each())
+        n, y = _without_others(n, y, chosen, scale)
+        small, right = basis.T @ n @ basis, y @ basis
+        try:
+            each = np.linalg.solve(small, right[:, :, None])[:, :, 0]
+        except np.linalg.LinAlgError:
+            return 1.0
+        spread = each - theta
+        covariance = (count - 1) / count * spread.T @ spread
+        try:
+            t2 = float(theta @ np.linalg.solve(covariance, theta))
+        except np.linalg.LinAlgError:
+            return 1.0
+        statistic = (count - p) / (p * (count - 1)) * t2
+        worst = max(worst, float(f_distribution.sf(statistic, p, count - p)))
+        tried = True
+    return worst if tried else 1.0
+
+
+def _without_others(n: Array, y: Array, chosen: NDArray[np.int_], scale: Array) -> tuple[Array, Array]:
+    """Project the coefficients that were not chosen off a batch of normal equations."""
+    others = np.setdiff1d(np.arange(len(scale)), chosen)
+    if not len(others):
+        return n, y
+    root = np.sqrt(np.maximum(scale, 1e-300))
+    n, y = n / np.outer(root, root), y / root
+    own = np.linalg.pinv(n[:, others[:, None], others], rcond=1e-8, hermitian=True)
+    mixed = n[:, chosen[:, None], others]
+    n2 = n[:, chosen[:, None], chosen] - mixed @ own @ np.swapaxes(mixed, 1, 2)
+    y2 = y[:, chosen] - (mixed @ own @ y[:, others, None])[:, :, 0]
+    return n2 * np.outer(root[chosen], root[chosen]), y2 * root[chosen]
+
+
+def cauchy_combination(p_values: Sequence[float]) -> float:
+    """One p value from several that may depend on each other (ACAT, Liu and Xie 2020)."""
+    p = np.clip(np.asarray(p_values, dtype=float), 1e-300, 1 - 1e-12)
+    # tan(pi (1/2 - p)) is 1 / (pi p) for the smallest p, where the tangent itself overflows its accuracy
+    statistic = np.mean(np.where(p < 1e-15, 1 / (np.pi * p), np.tan(np.pi * (0.5 - p))))
+    if statistic > 1e15:
+        return float(1 / (np.pi * statistic))
+    return float(0.5 - np.arctan(statistic) / np.pi)
+
+
+@dataclass(frozen=True)
+class Gain:
+    """What terms gain on data their coefficients have not seen.
+
+    Attributes:
+        before, after: (folds,) sums of squared whitened residuals.
+        values: how many values each fold holds.
+    """
+
+    before: Array
+    after: Array
+    values: Array
+
+    @property
+    def total(self) -> float:
+        """Reduction of the sum of squares; twice the log likelihood ratio."""
+        return float(np.sum(self.before - self.after))
+
+    @property
+    def t(self) -> float:
+        """Paired t of the reduction per value over folds."""
+        each = (self.before - self.after) / self.values
+        spread = float(each.std(ddof=1))
+        return float(each.mean() / (spread / np.sqrt(len(each)))) if spread > 0 else 0.0
+
+    @property
+    def rms(self) -> tuple[float, float]:
+        """Whitened rms before and after."""
+        count = float(self.values.sum())
+        return float(np.sqrt(self.before.sum() / count)), float(np.sqrt(max(self.after.sum(), 0.0) / count))
+
+
+def held_out_gain(g: Grams, freedom: int, blocked: Array | None = None) -> Gain:
+    """Gain over contiguous folds, a block's gap between training and test.
+
+    Parameters
+    ----------
+    g: the finest blocks.
+    freedom: residual values a sample.
+    blocked: (P,) terms that belong to both models compared.
+    """
+    count = len(g.zz)
+    folds = min(FOLDS, count)
+    edges = np.linspace(0, count, folds + 1).round().astype(int)
+    test_masks, train_masks = np.zeros((folds, count), dtype=bool), np.ones((folds, count), dtype=bool)
+    gap = 1 if count >= 4 * folds else 0
+    for k, (a, b) in enumerate(zip(edges[:-1], edges[1:], strict=True)):
+        test_masks[k, a:b] = True
+        train_masks[k, max(a - gap, 0) : b + gap] = False
+    train, test = g.chosen(train_masks), g.chosen(test_masks)
+    n, y = normal(train)
+    scale = own_information(g)
+    theta = np.stack([solve(n[k], y[k], scale).theta for k in range(folds)])
+    if blocked is None:
+        before, after = held_out(train, test, theta)
+    else:
+        without = np.zeros_like(theta)
+        keep = np.flatnonzero(blocked)
+        if len(keep):
+            without[:, keep] = [
+                solve(n[k][np.ix_(keep, keep)], y[k][keep], scale[keep]).theta for k in range(folds)
+            ]
+        before, after = held_out(train, test, without)[1], held_out(train, test, theta)[1]
+    return Gain(before, after, test.samples * freedom)
