@@ -170,7 +170,7 @@ def _table(
         columns.append(numbers)
         keep &= ~unreadable
         for row in np.flatnonzero(unreadable):
-            bad[whole[row][0]] = f"{str(column[row])[:20]!r} in column {names[i]}"
+            bad.setdefault(whole[row][0], f"{str(column[row])[:20]!r} in column {names[i]}")
     if len(bad) > max_bad_share * len(lines) or not keep.any():
         raise DataError(
             f"{len(bad)} of {len(lines)} rows cannot be read: {_quoted(bad)}",
@@ -195,6 +195,9 @@ def _parsed(lines: list[str], split: _Splitter, decimal: str, missing: Sequence[
 
     import pandas as pd
 
+    # From 3.1 on every number is read to the last bit; before, only on request.
+    new = tuple(int(n) for n in pd.__version__.split(".")[:2]) >= (3, 1)
+    exact: dict[str, Any] = {} if new else {"float_precision": "round_trip"}
     frame = pd.read_csv(
         io.StringIO("\n".join(lines)),
         sep=r"\s+" if split.separator is None else split.separator,
@@ -205,8 +208,8 @@ def _parsed(lines: list[str], split: _Splitter, decimal: str, missing: Sequence[
         na_values=list(missing),
         skipinitialspace=True,
         quoting=csv.QUOTE_MINIMAL if split.quoted else csv.QUOTE_NONE,
-        float_precision="round_trip",
         low_memory=False,
+        **exact,
     )
     return [frame[i].to_numpy() for i in range(width)]
 

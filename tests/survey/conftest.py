@@ -8,13 +8,20 @@ from typing import Any
 
 import pytest
 import xarray as xr
+from hypothesis import settings
+from survey_cases import array_variables
+
 from magtensor.recipe.plan import readers
 from magtensor.registry import Registry
 from magtensor.survey.canonical import write_canonical
 from magtensor.survey.model import Survey
 from magtensor.survey.sections import SurveySection
 from magtensor.survey.source import Source
-from survey_cases import array_variables
+
+# A first example pays for imports; what a test may take is the business of the whole run.
+settings.register_profile("no_deadline", deadline=None)
+settings.load_profile("no_deadline")
+
 
 @pytest.fixture
 def variables() -> dict[str, Any]:

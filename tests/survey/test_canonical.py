@@ -9,10 +9,11 @@ import h5py
 import numpy as np
 import pytest
 import xarray as xr
+from survey_cases import START, array_variables
+
 from magtensor.errors import DataError
 from magtensor.survey.canonical import read_canonical, write_canonical
 from magtensor.survey.model import Survey
-from survey_cases import START, array_variables
 
 
 def plain_file(path: Path, **changes: Any) -> Path:
@@ -115,7 +116,10 @@ def test_sensor_names_have_a_default_and_other_groups_are_mentioned(tmp_path: Pa
     [
         ({"b_raw": ((), None, {})}, "there is no dataset b_raw"),
         ({"time": ((), None, {})}, "there is no dataset time"),
-        ({"b_raw": ((), np.zeros((60, 12)), {"units": "nT"})}, r"b_raw: shape \(60, 12\) is not \(time, sensor, axis\)"),
+        (
+            {"b_raw": ((), np.zeros((60, 12)), {"units": "nT"})},
+            r"b_raw: shape \(60, 12\) is not \(time, sensor, axis\)",
+        ),
         ({"b_raw": ((), np.zeros((59, 4, 3)), {"units": "nT"})}, r"b_raw: shape \(59, 4, 3\)"),
         ({"b_raw": ((), np.zeros((60, 4, 3)), {})}, "b_raw: it has no units; nT is expected"),
         ({"b_raw": ((), np.zeros((60, 4, 3)), {"units": "V"})}, "b_raw: 'V' is a voltage"),
@@ -148,7 +152,9 @@ def test_unknown_dimension_names(tmp_path: Path) -> None:
         {"time": ("time", np.arange(60.0), {"units": START})},
     ).to_netcdf(tmp_path / "dims.nc", engine="h5netcdf")
     # A dimension without values has no name in plain HDF5 but its scale's.
-    with pytest.raises(DataError, match=r"b_raw: dimensions \(time, magnetometer, axis\) are not \(time, sensor, axis\)"):
+    with pytest.raises(
+        DataError, match=r"b_raw: dimensions \(time, magnetometer, axis\) are not \(time, sensor, axis\)"
+    ):
         read_canonical(tmp_path / "dims.nc")
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+
 from magtensor.units import UNITS, UnitError, canonical_unit, convert, dimension, is_unit
 
 FINITE = st.floats(-1e12, 1e12, allow_nan=False)

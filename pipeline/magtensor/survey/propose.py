@@ -219,12 +219,18 @@ def _triples(tables: Tables, rows: int, guess: _Guess) -> None:
                 continue
             entry, why = _channel_scale(channel, units, triple)
             guess.channels.append(f"    {channel}: {{from: {refs}, {entry}}}{why}")
-        elif kind == "magnetic flux density" or _MAGNETIC.search(triple.label) or (not triple.named and not kind):
+        elif kind == "magnetic flux density" or _MAGNETIC.search(triple.label) or (not kind and _earthlike(triple)):
             sensors += 1
             entry, why = _field_scale(units, triple)
             guess.sensors.append(f"    S{sensors}: {{from: {refs}, {entry}}}{why}")
         else:
             guess.used -= {r.split("[")[0] for r in triple.refs}
+
+
+def _earthlike(triple: Triple) -> bool:
+    """Nothing in the names, but a sphere; or the Earth's field in nT or uT."""
+    low, high = EARTH_FIELD_NT
+    return not triple.named or low <= triple.radius <= high or low <= 1000 * triple.radius <= high
 
 
 def _refs(refs: tuple[str, ...]) -> str:

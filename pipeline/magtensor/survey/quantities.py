@@ -22,6 +22,7 @@ from magtensor.survey.times import (
     split_since,
     texts_to_seconds,
     to_epoch,
+    without_days,
 )
 from magtensor.units import UnitError, convert
 
@@ -187,6 +188,8 @@ def _column_times(section: TimeSection, tables: Tables) -> tuple[NDArray[np.floa
         unit, epoch = parts if parts is not None else (units, _epoch(section))
         if section.counter is not None:
             values = unwrapped(values.astype(np.float64), section.counter)
+        if epoch is not None:
+            values, epoch = without_days(values, unit, epoch)
         return numbers_to_seconds(values, unit), epoch
     except ValueError as error:
         raise DataError(str(error), where=where) from error

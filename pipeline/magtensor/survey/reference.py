@@ -78,7 +78,14 @@ def spikes(values: Floats, threshold: float) -> Bools:
 
     off = np.abs(values - median_filter(values, SPIKE_WINDOW, mode="nearest"))
     scale = max(1.4826 * float(np.median(off)), resolution(values))
-    return off > threshold * scale if scale > 0 else off > 0
+    limit = threshold * scale
+    bad = off > limit
+    if not bad.any() or bad.all():
+        return bad
+    # Beside a spike the running median steps aside on a steep record; what lies on the line between good
+    # neighbours is good.
+    place = np.arange(len(values))
+    return bad & (np.abs(values - np.interp(place, place[~bad], values[~bad])) > limit)
 
 
 def noise(values: Floats) -> float:

@@ -83,6 +83,23 @@ def numbers_to_seconds(values: NDArray[np.generic], units: str) -> NDArray[np.fl
     return convert(values, units, "s")
 
 
+def without_days(values: NDArray[np.generic], units: str, epoch: datetime) -> tuple[NDArray[np.generic], datetime]:
+    """Whole numbers with the days up to the first moved into the epoch; other numbers as they are.
+
+    Nanoseconds since 1970 exceed what a float64 resolves; nanoseconds of a survey do not.
+
+    Args:
+        values: (N,) whole numbers or others.
+        units: of the values.
+        epoch: what they count from.
+    """
+    per_day = round(float(86400.0 * convert(1.0, "s", units)))
+    if values.dtype.kind not in "iu" or len(values) == 0:
+        return values, epoch
+    days = int(values[0]) // per_day
+    return values - np.asarray(days * per_day, dtype=values.dtype), epoch + timedelta(days=days)
+
+
 def texts_to_seconds(
     texts: NDArray[np.str_], pattern: str | None, day: datetime | None
 ) -> tuple[NDArray[np.float64], datetime]:

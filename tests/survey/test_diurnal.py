@@ -1,0 +1,157 @@
+"""detrend_diurnal: the reference at the array's times, and everything a base station does wrong."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from survey_cases import START, array_variables
+
+from magtensor.errors import DataError
+from magtensor.survey.model import Survey
+from magtensor.survey.reference import noise, sample, spikes
+from magtensor_stages import detrend_diurnal
+
+
+def survey_with(time: Any, field: Any, origin: str = "measured") -> Survey:
+    variables = array_variables()
+    variables["reference/time"] = (("time",), np.asarray(time, dtype=float), {"units": START})
+    attributes = {"units": "nT", "origin": origin}
+    variables["reference/total_field"] = (("time",), np.asarray(field, dtype=float), attributes)
+    return Survey.build(variables, {"source": "s.nc"})
+
+
+def values(given: dict[str, Any], name: str) -> np.ndarray:
+    return np.asarray(given[name][1])
+
+
+RECORD = arrays(np.float64, 12, elements=st.floats(-1e5, 1e5))
+
+
+@given(arrays(np.float64, 12, elements=st.floats(0.01, 3)), RECORD, st.booleans())
+def test_no_overshoot_and_exact_at_the_samples(steps: np.ndarray, record: np.ndarray, smooth: bool) -> None:
+    time = np.cumsum(steps)
+    at = np.linspace(time[0], time[-1], 300)
+    found = sample(at, time, record, smooth=smooth, max_gap_s=100.0)
+    right = np.clip(np.searchsorted(time, at, side="right"), 1, len(time) - 1)
+    slack = 1e-12 * np.abs(record).max()
+    assert (found.values >= np.minimum(record[right - 1], record[right]) - slack).all()
+    assert (found.values <= np.maximum(record[right - 1], record[right]) + slack).all()
+    np.testing.assert_array_equal(sample(time, time, record, smooth=smooth, max_gap_s=100.0).values, record)
+    assert found.covered.all()
+    assert (found.weight_norm <= 1 + 1e-12).all()
+    assert (found.weight_norm >= np.sqrt(0.5) - 1e-12).all()
+
+
+def test_a_slow_variation_is_followed() -> None:
+    time = np.arange(-2.0, 45.0)
+    given = detrend_diurnal(survey_with(time, 48_000 + 20 * np.sin(time / 8)))
+    at = np.arange(400) * 0.1
+    # Cubic interpolation of a sine of amplitude 20 and step 1/8 rad; monotone slopes cost a third power near its peaks.
+    np.testing.assert_allclose(values(given, "total_field"), 48_000 + 20 * np.sin(at / 8), atol=20 * (1 / 8) ** 2 / 2)
+    np.testing.assert_allclose(
+        values(given, "diurnal"), values(given, "total_field") - values(given, "total_field").mean(), atol=1e-9
+    )
+    assert given["total_field"][2]["base_nT"] == pytest.approx(values(given, "total_field").mean())
+
+
+def test_pchip_follows_better_than_lines() -> None:
+    time = np.arange(-3.0, 45.0, 3.0)
+    survey = survey_with(time, 48_000 + 20 * np.sin(time / 8))
+    true = 48_000 + 20 * np.sin(np.arange(400) / 80)
+    rms = [
+        np.sqrt(np.mean((values(detrend_diurnal(survey, interpolation=how), "total_field") - true) ** 2))
+        for how in ("pchip", "linear")
+    ]
+    assert rms[0] < 0.6 * rms[1]
+
+
+@pytest.mark.parametrize(
+    ("base", "expected"), [("mean", 48_019.95), ("median", 48_019.95), ("first", 48_000.0), (47_500.0, 47_500.0)]
+)
+def test_base_values(base: Any, expected: float) -> None:
+    time = np.arange(0.0, 41.0)
+    given = detrend_diurnal(survey_with(time, 48_000 + time), base=base)
+    assert given["diurnal"][2]["base_nT"] == pytest.approx(expected, abs=1e-6)
+    np.testing.assert_allclose(values(given, "diurnal") + given["diurnal"][2]["base_nT"], values(given, "total_field"))
+
+
+def test_latency() -> None:
+    """A ramp of 1 nT/s stamped 2 s late reads 2 nT too low until the stamps are moved back."""
+    time = np.arange(-5.0, 50.0)
+    late = survey_with(time, 48_000 + (time - 2))
+    found = values(detrend_diurnal(late, latency_s=2.0), "total_field")
+    np.testing.assert_allclose(found, 48_000 + np.arange(400) * 0.1, atol=1e-9)
+
+
+def test_a_reference_that_ends_early() -> None:
+    survey = survey_with(np.arange(0.0, 31.0), np.full(31, 48_000.0))
+    with pytest.raises(DataError, match=r"does not cover 89 of 400 samples, first at t = 31\.100 s") as caught:
+        detrend_diurnal(survey)
+    assert "from t = 0.000 to 30.000 s, the survey from 0.000 to 39.900 s" in str(caught.value)
+    assert "s.nc: reference/total_field" in str(caught.value)
+    given = detrend_diurnal(survey, uncovered="mask")
+    bad = np.isnan(values(given, "total_field"))
+    np.testing.assert_array_equal(bad, np.arange(400) * 0.1 > 31.0)
+    np.testing.assert_array_equal(values(given, "good"), np.repeat(~bad[:, None], 4, axis=1))
+    assert [(f.samples, f.by) for f in given["flags"]] == [(89, "detrend_diurnal")]
+    assert np.isfinite(given["diurnal"][2]["base_nT"])
+
+
+def test_a_gap_in_the_reference() -> None:
+    time = np.delete(np.arange(0.0, 41.0), slice(11, 20))
+    survey = survey_with(time, np.full(len(time), 48_000.0))
+    with pytest.raises(DataError, match=r"does not cover 99 of 400 samples, first at t = 10\.100 s"):
+        detrend_diurnal(survey)
+    assert detrend_diurnal(survey, max_gap_s=10.0)["flags"] == []
+    given = detrend_diurnal(survey, uncovered="mask")
+    assert np.isnan(values(given, "total_field")).sum() == 99
+
+
+def test_no_overlap_at_all_is_refused_even_when_masking() -> None:
+    survey = survey_with(np.arange(3600.0, 3700.0), np.full(100, 48_000.0))
+    with pytest.raises(DataError, match="covers no sample of the survey"):
+        detrend_diurnal(survey, uncovered="mask")
+
+
+def test_a_constant_reference_covers_everything() -> None:
+    given = detrend_diurnal(survey_with([5.0, 6.0], [48_000.0, 48_000.0], origin="constant"))
+    np.testing.assert_array_equal(values(given, "total_field"), 48_000.0)
+    np.testing.assert_array_equal(values(given, "diurnal"), 0.0)
+    assert "total_field_std" not in given
+
+
+def test_spikes() -> None:
+    time = np.arange(-5.0, 50.0)
+    rng = np.random.default_rng(1)
+    clean = 48_000 + 5 * np.sin(time / 9)
+    record = np.round(clean + 0.05 * rng.normal(size=len(time)), 1)
+    spiky = record.copy()
+    spiky[[12, 30, 31]] += [250, -90, -80]
+    given = detrend_diurnal(survey_with(time, spiky), despike=10.0)
+    true = np.interp(np.arange(400) * 0.1, time, clean)
+    assert np.abs(values(given, "total_field") - true).max() < 0.6
+    assert {f.sensor for f in given["flags"]} == {"reference"}
+    assert sum(f.samples for f in given["flags"]) == 3
+    assert not spikes(record, 10.0).any()
+    assert np.abs(values(detrend_diurnal(survey_with(time, spiky)), "total_field") - true).max() > 200
+
+
+def test_the_reference_s_noise_is_carried() -> None:
+    rng = np.random.default_rng(2)
+    time = np.arange(-5.0, 50.0, 0.05)
+    record = 48_000 + np.sin(time / 9) + 0.3 * rng.normal(size=len(time))
+    assert noise(record) == pytest.approx(0.3, rel=0.1)
+    given = detrend_diurnal(survey_with(time + 0.0125, record), interpolation="linear")
+    true = 48_000 + np.sin((np.arange(400) * 0.1 - 0.0125) / 9)
+    off = values(given, "total_field") - true
+    assert np.sqrt(np.mean((off / values(given, "total_field_std")) ** 2)) == pytest.approx(1.0, abs=0.15)
+
+
+def test_resolution_is_the_least_uncertainty() -> None:
+    record = np.round(48_000 + np.arange(500) * 0.001, 1)
+    assert noise(record) >= 0.1 / np.sqrt(12)
