@@ -125,7 +125,8 @@ def test_an_unknown_reader(tmp_path: Path, registered: dict[str, Any]) -> None:
 
 
 def test_show_prints_columns_and_mapping(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    np.savetxt(tmp_path / "a.csv", np.column_stack([np.arange(N), field()]), header="t,bx [nT],by [nT],bz [nT]", comments="",
+    table = np.column_stack([np.arange(N), field()])
+    np.savetxt(tmp_path / "a.csv", table, header="t,bx [nT],by [nT],bz [nT]", comments="",
                delimiter=",")  # fmt: skip
     show(tmp_path / "a.csv")
     printed = capsys.readouterr().out

@@ -211,8 +211,6 @@ def _triples(tables: Tables, rows: int, guess: _Guess) -> None:
             (n for n, (pattern, of) in _KINDS.items() if kind == of or (not kind and pattern.search(triple.label))),
             None,
         )
-        if channel is None and not triple.named and any(abs(triple.radius / g - 1) < 0.15 for g in _G_COUNTS):
-            channel = "acceleration"
         guess.used |= {r.split("[")[0] for r in triple.refs}
         if channel is not None:
             if any(line.lstrip().startswith(f"{channel}:") for line in guess.channels):
@@ -248,10 +246,10 @@ def _field_scale(units: str | None, triple: Triple) -> tuple[str, str]:
         if low <= float(convert(length, name, "nT")) <= high:
             return f"units: {name}", f"  # guessed from the magnitude, {length:.4g}"
     scale = _ROUND_FIELD_NT / length if length > 0 else 1.0
-    return (
-        f"units: nT, scale: {scale:.6g}",
-        "  # a guess that makes the field 50 uT: put the data sheet's scale here",
-    )
+    why = "  # a guess that makes the field 50 uT: put the data sheet's scale here"
+    if not triple.named and any(abs(length / g - 1) < 0.15 for g in _G_COUNTS):
+        why += "; or is it an accelerometer?"
+    return f"units: nT, scale: {scale:.6g}", why
 
 
 def _channel_scale(channel: str, units: str | None, triple: Triple) -> tuple[str, str]:
@@ -262,8 +260,7 @@ def _channel_scale(channel: str, units: str | None, triple: Triple) -> tuple[str
         one_g = min(_G_COUNTS, key=lambda g: abs(np.log(triple.radius / g)))
         name = {1.0: "g", 9.81: "m/s2", 1000.0: "mg"}.get(one_g)
         entry = f"units: {name}" if name else f"units: g, scale: 1/{one_g:.0f}"
-        doubt = "" if triple.named else "; it may also be a magnetometer"
-        return entry, f"  # guessed from the magnitude, {triple.radius:.4g}{doubt}"
+        return entry, f"  # guessed from the magnitude, {triple.radius:.4g}"
     return f"units: {wanted}", "  # the units are a guess"
 
 
