@@ -82,7 +82,7 @@ def survey_from(tables: Tables) -> Survey:
     }
     ignored = []
     for name, column in tables.columns.items():
-        if name in ("time", "sensor", "axis") or name.startswith("reference/"):
+        if name in ("time", "sensor", "axis", "quaternion") or name.startswith("reference/"):
             continue
         if "/" in name:
             ignored.append(name)
