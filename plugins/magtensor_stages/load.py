@@ -103,6 +103,8 @@ def _increasing(survey: Survey, time_faults: str, where: str, notes: list[str]) 
     now = float(time[first])
     if not np.isfinite(now):
         what = f"the time of sample {first} is missing"
+    elif now > before or not first:
+        what = f"the time of sample {first}, {_clock(now)}, is later than times after it"
     elif now == before:
         what = f"sample {first} has the same time as the one before, {_clock(now)}"
     else:
@@ -233,6 +235,13 @@ def _refuse_magnitude(survey: Survey, where: str) -> None:
         suspicion = checks.unit_suspicion(reference)
         if suspicion:
             raise DataError(suspicion, where=f"{where}: reference/total_field", hint=f"are its units right? {accept}")
+        for name, median in zip(survey.sensors, medians, strict=True):
+            if not 1 / checks.MARGIN <= median / reference <= checks.MARGIN:
+                raise DataError(
+                    f"the median magnitude is {median:.6g} nT, that of the reference {reference:.6g} nT",
+                    where=f"{where}: sensor {name}",
+                    hint=f"are the scale, the offset and the reference those of this survey? {accept}",
+                )
 
 
 def _flagged(survey: Survey, saturation_nT: float | None, where: str) -> tuple[NDArray[np.bool_], list[Flag]]:

@@ -60,6 +60,7 @@ def test_a_survey_without_a_source_is_the_users_mistake() -> None:
             r"time: the clock steps back at sample 7, from t = 0\.600 s to t = 0\.100 s; 3 samples",
         ),
         (set_to(7, np.nan), r"time: the time of sample 7 is missing"),
+        (set_to(7, 1e9), r"time: the time of sample 7, t = 1000000000\.000 s, is later than times after it; 1 sample"),
     ],
 )
 def test_time_faults(load_variables: Load, variables: Variables, change: Any, message: str) -> None:
@@ -198,6 +199,11 @@ def test_magnitudes_betray_wrong_units(load_variables: Load, variables: Variable
 def test_a_reference_in_the_wrong_units(load_variables: Load, variables: Variables) -> None:
     with pytest.raises(DataError, match=r"reference/total_field: the median .*looks like uT labelled nT"):
         load_variables(changed(variables, "reference/total_field", lambda f: f / 1000))
+
+
+def test_a_reference_of_another_survey(load_variables: Load, variables: Variables) -> None:
+    with pytest.raises(DataError, match=r"sensor S1: the median magnitude is .* nT, that of the reference 2[34]"):
+        load_variables(changed(variables, "reference/total_field", lambda f: f * 0.49))
 
 
 def test_copied_columns(load_variables: Load, variables: Variables) -> None:

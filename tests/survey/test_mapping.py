@@ -374,3 +374,16 @@ def test_standard_atmosphere() -> None:
     assert np.isnan(pressure_height(np.array([50.0, 0.0, -3.0]))).all()
     one_up = dipole_decrease(50_000.0, np.array([1000.0]))[0]
     assert one_up == pytest.approx(50_000 * (1 - 3 * 1000 / 6_371_200), abs=0.01)
+
+
+def test_the_examples_of_the_documentation_are_valid() -> None:
+    import json
+    import re
+
+    import yaml
+
+    page = (Path(__file__).parents[2] / "docs" / "surveys.md").read_text()
+    blocks = re.findall(r"```yaml\n(.*?)```", page, re.DOTALL)
+    assert len(blocks) >= 2
+    for block in blocks:
+        SurveySection.model_validate_json(json.dumps(yaml.safe_load(block)["survey"]))

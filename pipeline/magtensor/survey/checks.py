@@ -26,15 +26,18 @@ RIVALS = (
 
 
 def moves_on(time: Floats) -> Bools:
-    """(N,) True where the time is known and later than every one before.
+    """(N,) True for the samples to keep so that the time increases.
 
-    A sample that steps back or repeats is False, and so is each that follows until the clock has caught up.
+    Either a sample must be later than all before it (a clock that steps back), or earlier than all after it (one
+    stamp that is far too late); whichever keeps more samples. A missing time is False.
     """
     known = np.isfinite(time)
-    running = np.maximum.accumulate(np.where(known, time, -np.inf))
-    onward = known.copy()
-    onward[1:] &= time[1:] > running[:-1]
-    return onward
+    latest = np.maximum.accumulate(np.where(known, time, -np.inf))
+    earliest = np.minimum.accumulate(np.where(known, time, np.inf)[::-1])[::-1]
+    forward, backward = known.copy(), known.copy()
+    forward[1:] &= time[1:] > latest[:-1]
+    backward[:-1] &= time[:-1] < earliest[1:]
+    return backward if backward.sum() > forward.sum() else forward
 
 
 @dataclass(frozen=True)

@@ -63,7 +63,7 @@ def _hint(message: str) -> str:
     if "truncated file" in message:
         return "copy it again from its source; the recording may have been interrupted"
     if "signature not found" in message:
-        return "name its reader in the recipe's survey section (`magtensor plugins` lists the readers)"
+        return "a file of another kind needs a mapping in the recipe; `magtensor inspect` proposes one"
     return ""
 
 
