@@ -18,6 +18,7 @@ from magtensor.errors import UsageError
 MAX_BYTES = 1_000_000
 MAX_NODES = 100_000  # after aliases are expanded; a recipe has some hundreds
 MAX_DEPTH = 50
+TAG = "tag:yaml.org,2002:"
 
 Location = tuple[str | int, ...]
 
@@ -99,7 +100,7 @@ for _tag, _pattern, _first in [
     ),
     ("merge", r"<<", "<"),
 ]:
-    _PlainLoader.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(f"^(?:{_pattern})$"), list(_first))
+    _PlainLoader.add_implicit_resolver(f"{TAG}{_tag}", re.compile(f"^(?:{_pattern})$"), list(_first))
 
 
 class _Reader:
@@ -123,26 +124,28 @@ class _Reader:
         if id(node) in self.open:
             raise self.fail(node, "an alias contains itself")
         self.lines.setdefault(at, node.start_mark.line + 1)
-        if not node.tag.startswith("tag:yaml.org,2002:") or node.tag.split(":")[-1].startswith("python"):
-            raise self.fail(node, f"the tag {node.tag} is not allowed; recipes are plain YAML without tags")
         self.open.add(id(node))
         try:
             if isinstance(node, yaml.MappingNode):
+                self.require_tag(node, "map")
                 return self.mapping(node, at)
             if isinstance(node, yaml.SequenceNode):
+                self.require_tag(node, "seq")
                 return [self.read(child, (*at, i)) for i, child in enumerate(node.value)]
             return self.scalar(node)
         finally:
             self.open.discard(id(node))
 
+    def require_tag(self, node: yaml.Node, *kinds: str) -> None:
+        if node.tag not in {f"{TAG}{kind}" for kind in kinds}:
+            raise self.fail(node, f"the tag {node.tag} is not allowed here; recipes are plain YAML without tags")
+
     def mapping(self, node: yaml.MappingNode, at: Location) -> dict[Any, Any]:
-        if node.tag != "tag:yaml.org,2002:map":
-            raise self.fail(node, f"the tag {node.tag} is not allowed; recipes are plain YAML without tags")
         found: dict[Any, Any] = {}
         for key_node, value_node in node.value:
             if not isinstance(key_node, yaml.ScalarNode):
                 raise self.fail(key_node, "a key must be a plain word")
-            if key_node.tag == "tag:yaml.org,2002:merge":
+            if key_node.tag == f"{TAG}merge":
                 raise self.fail(key_node, "merge keys (<<) are not allowed; write the options out")
             key = self.scalar(key_node)
             if key in found:
@@ -154,7 +157,8 @@ class _Reader:
         return found
 
     def scalar(self, node: yaml.Node) -> Any:
-        kind = node.tag.rsplit(":", 1)[-1]
+        self.require_tag(node, "str", "null", "bool", "int", "float")
+        kind = node.tag.removeprefix(TAG)
         text = str(node.value)
         try:
             if kind == "str":
@@ -165,18 +169,9 @@ class _Reader:
                 return text.lower() == "true"
             if kind == "int":
                 return int(text, 0) if text[:2] in ("0x", "0o") else int(text)
-            if kind == "float":
-                return float(
-                    text.replace(".inf", "inf")
-                    .replace(".Inf", "inf")
-                    .replace(".INF", "inf")
-                    .replace(".nan", "nan")
-                    .replace(".NaN", "nan")
-                    .replace(".NAN", "nan")
-                )
+            return float(re.sub(r"\.(?=[inIN])", "", text))  # .inf and .nan
         except ValueError as error:
-            raise self.fail(node, f"{text!r} is not a number: {error}") from error
-        raise self.fail(node, f"the tag {node.tag} is not allowed; recipes are plain YAML without tags")
+            raise self.fail(node, f"{text[:40]!r} is not a number") from error
 
 
 def parse_scalar(text: str) -> Any:
