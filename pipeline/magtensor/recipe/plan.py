@@ -149,19 +149,23 @@ def override(document: Document, text: str) -> Document:
     here: Any = value
     at: list[str | int] = []
     parts = path.strip().split(".")
+    if parts[0] == "survey" and len(parts) > 1 and isinstance(value, dict) and isinstance(value.get("survey"), str):
+        value["survey"] = {"file": value["survey"]}
     for i, part in enumerate(parts):
         last = i == len(parts) - 1
         if isinstance(here, list):
-            number = _item(here, part)
-            if number is None:
+            found, place = _items(here, part), ".".join(parts[:i])
+            if not found:
                 names = [n for item in here if (n := _item_name(item))]
-                raise UsageError(
-                    f"--set {text}: there is no {part} in {'.'.join(parts[:i])}{did_you_mean(part, names)}"
-                )
+                raise UsageError(f"--set {text}: there is no {part} in {place}{did_you_mean(part, names)}")
+            if len(found) > 1:
+                ways = " or ".join(f"{place}.{n}.{part}" for n in found)
+                raise UsageError(f"--set {text}: {place} has {part} more than once; say which: {ways}")
+            number = found[0]
             at.append(number)
             if isinstance(here[number], str):
                 here[number] = {here[number]: {}}
-            if not part.lstrip("-").isdigit():
+            if not part.isdecimal():
                 at.append(part)
                 if here[number][part] is None:
                     here[number][part] = {}
@@ -205,16 +209,16 @@ def _set_of(document: Document) -> dict[Location, str]:
 
 
 def _item_name(item: Any) -> str | None:
-    if isinstance(item, str):
-        return item
-    return str(next(iter(item))) if isinstance(item, dict) and len(item) == 1 else None
+    """The name of a stage in the list: the item itself, or the one key of a mapping."""
+    if isinstance(item, dict) and len(item) == 1:
+        item = next(iter(item))
+    return item if isinstance(item, str) else None
 
 
-def _item(items: list[Any], part: str) -> int | None:
-    if part.isdigit():
-        return int(part) if int(part) < len(items) else None
-    named = [i for i, item in enumerate(items) if _item_name(item) == part]
-    return named[0] if named else None
+def _items(items: list[Any], part: str) -> list[int]:
+    if part.isdecimal():
+        return [int(part)] if int(part) < len(items) else []
+    return [i for i, item in enumerate(items) if _item_name(item) == part]
 
 
 class _Planner:
@@ -351,43 +355,59 @@ class _Planner:
         bound: dict[str, Any] = {}
         described: dict[str, Any] = {}
         rest = dict(options)
+        whole = True  # one mistake must not hide the others: go on to the end, then give up
         if component.metrics_option is not None:
             found = self.metrics(component.metrics_option, rest.pop(component.metrics_option, None), at)
             if found is None:
-                return None
-            bound[component.metrics_option], described[component.metrics_option], used = found
-            taken += used
+                whole = False
+            else:
+                bound[component.metrics_option], described[component.metrics_option], used = found
+                taken += used
         if component.method_option is not None:
             option, default = component.method_option
-            name = rest.pop(option, default)
-            if name is None:
-                names = ", ".join(self.registry.names("method", component.name))
-                self.problems.add(at, f"needs {option!r}: one of {names or 'none that is installed'}")
-                return None
-            if ("method", component.name, str(name)) not in self.registry.components:
-                self.problems.add((*at, option), self.registry.unknown("method", str(name), component.name))
-                return None
-            method = self.registry.find("method", str(name), component.name)
             own = set(component.options.model_fields)
-            theirs = set(method.options.model_fields)
+            method = self.method(component, rest.pop(option, default), at)
+            if method is None:
+                whole = False
+                of_stage = [c for (_, step, _), c in self.registry.components.items() if step == component.name]
+                theirs = {name for c in of_stage for name in c.options.model_fields}
+                what = f"{component.name} with any method"
+            else:
+                theirs = set(method.options.model_fields)
+                what = f"{component.name} with method {method.name}"
             known = sorted(own | theirs | {option})
             for key in [k for k in rest if k not in known]:
                 near = did_you_mean(str(key), known) or f"; it has {', '.join(known)}"
-                self.problems.add((*at, key), f"{component.name} with method {name} has no option {key!r}{near}")
-                del rest[key]
-            model = self.problems.validated(method.options, {k: v for k, v in rest.items() if k in theirs}, at)
+                self.problems.add((*at, key), f"{what} has no option {key!r}{near}")
+                whole = False
+            if method is not None:
+                model = self.problems.validated(method.options, {k: v for k, v in rest.items() if k in theirs}, at)
+                if model is None:
+                    whole = False
+                else:
+                    bound[option] = functools.partial(method.function, **_values(model))
+                    bound[option].__name__ = method.name
+                    described |= {option: method.name} | model.model_dump(mode="json")
+                    taken.append(method)
             rest = {k: v for k, v in rest.items() if k in own}
-            if model is None:
-                return None
-            bound[option] = functools.partial(method.function, **_values(model))
-            bound[option].__name__ = method.name
-            described |= {option: method.name} | model.model_dump(mode="json")
-            taken.append(method)
         model = self.problems.validated(component.options, rest, at)
-        if model is None:
+        if model is None or not whole:
             return None
         described |= model.model_dump(mode="json")
         return PlannedStage(component, bound | _values(model), described, component.declared(described), tuple(taken))
+
+    def method(self, stage: Component, name: Any, at: Location) -> Component | None:
+        """The method of a stage that the recipe names; None, with the mistake collected, if there is none."""
+        assert stage.method_option is not None
+        option, _ = stage.method_option
+        if name is None:
+            names = ", ".join(self.registry.names("method", stage.name))
+            self.problems.add(at, f"needs {option!r}: one of {names or 'none that is installed'}")
+            return None
+        if ("method", stage.name, str(name)) not in self.registry.components:
+            self.problems.add((*at, option), self.registry.unknown("method", str(name), stage.name))
+            return None
+        return self.registry.find("method", str(name), stage.name)
 
     def metrics(
         self, option: str, wanted: Any, at: Location

@@ -15,6 +15,12 @@ if TYPE_CHECKING:
 
     Model = TypeVar("Model", bound=BaseModel)
 
+# pydantic speaks of JSON, a recipe is YAML
+YAML_WORDS = {
+    "list_type": "a list", "tuple_type": "a list", "set_type": "a list",
+    "dict_type": "a mapping", "model_type": "a mapping", "model_attributes_type": "a mapping",
+}  # fmt: skip
+
 
 @dataclass
 class Problems:
@@ -60,15 +66,15 @@ class Problems:
         if kind == "extra_forbidden":
             known = _known_keys(model, error["loc"][:-1])
             near = did_you_mean(str(trail[-1]), known) or (f"; known here: {', '.join(known)}" if known else "")
-            self.add(
-                place[:-1], f"unknown key {str(trail[-1])!r}{near}"
-            ) if place not in self.document.lines else self.add(place, f"unknown key{near}")
+            self.add(place, f"unknown key{near}")
         elif kind == "missing":
             self.add(place, f"needs {str(error['loc'][-1])!r}")
         elif kind == "literal_error":
             expected = str(error["ctx"]["expected"])
             names = [w.strip("' ") for w in expected.replace(" or ", ",").split(",")]
             self.add(place, f"must be {expected}, not {_shown(here)}{did_you_mean(str(here), names)}")
+        elif kind in YAML_WORDS:
+            self.add(place, f"must be {YAML_WORDS[kind]}, not {_shown(here)}")
         else:
             message = str(error["msg"]).removeprefix("Value error, ")
             self.add(place, f"{message[:1].lower()}{message[1:]}, not {_shown(here)}" if _scalar(here) else message)
