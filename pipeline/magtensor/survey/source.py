@@ -158,9 +158,6 @@ class Source:
         fitting = [(len(s), c) for c in self.readers.values() for s in c.suffixes if name.lower().endswith(s.lower())]
         return max(fitting, key=lambda pair: pair[0])[1] if fitting else None
 
-    def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_tables": {}}  # tables hold open-file closures; a worker reads for itself
-
 
 def _option_errors(component: Component, options: Mapping[str, Any]) -> list[tuple[str, str]]:
     import json
