@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from magtensor.calibration.types import Array
-from magtensor.report.drawing import GRID, INK, MUTED, WASH, colour, label, legend, new_figure
+from magtensor.report.drawing import GRID, INK, MUTED, WIDTH, colour, label, legend, legend_height, panels
 from magtensor.report.reduction import cell_means, disc, trend
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.collections import PathCollection
     from matplotlib.figure import Figure
+    from matplotlib.image import AxesImage
 
 RINGS = (30.0, 60.0)  # deg above the plane z = 0
 AZIMUTHS = np.arange(-180.0, 180.1, 15.0)
@@ -36,54 +36,60 @@ def coverage(unit: Array, residual: Array | None, sensors: list[str]) -> Figure:
     """
     across = 1 if len(sensors) == 1 else 2 if len(sensors) <= 4 else 3
     rows = -(-len(sensors) // across)
-    figure = new_figure(0.3 + (1.85 if across == 3 else 2.7) * rows)
-    grid = figure.subplots(rows, 2 * across, squeeze=False).ravel()
-    dots = []
+    figure, axes_grid = panels(rows, 2 * across, {1: 2.6, 2: 2.1, 3: 1.4}[across], gap=0.1, between=0.08)
+    figure.subplots_adjust(left=0.02, right=1 - 0.95 / WIDTH, bottom=0.1 / figure.get_figheight())
+    grid = axes_grid.ravel()
+    maps: list[AxesImage] = []
     for i, name in enumerate(sensors):
         for axes, up in ((grid[2 * i], True), (grid[2 * i + 1], False)):
             _globe(axes)
             axes.set_title(f"{label(name, 16)}  {'z > 0' if up else 'z < 0'}", loc="center")
-            dots.append(_hemisphere(axes, unit[:, i], None if residual is None else residual[:, i], up))
+            maps.append(_hemisphere(axes, unit[:, i], None if residual is None else residual[:, i], up))
     for axes in grid[2 * len(sensors) :]:
         axes.set_axis_off()
     if residual is None:
         return figure
-    means = np.concatenate([d.get_array() for d in dots if d is not None] or [np.zeros(0)])
-    means = np.abs(np.ma.filled(np.ma.masked_invalid(means), 0.0))
+    means = np.abs(np.stack([np.ma.filled(np.ma.asarray(m.get_array()), np.nan) for m in maps]))
+    means = means[np.isfinite(means)]
     limit = float(np.percentile(means, 98)) if means.size and means.max() > 0 else 1.0
-    shown = [d for d in dots if d is not None]
-    for d in shown:
-        d.set_clim(-limit, limit)
-    if shown:
-        bar = figure.colorbar(shown[0], ax=list(grid), shrink=0.75 / rows**0.5, pad=0.01, aspect=24, extend="both")
-        bar.set_label("mean of |b| − F  (nT)")
-        bar.outline.set_visible(False)
+    for image in maps:
+        image.set_clim(-limit, limit)
+    tall = 1.8 / figure.get_figheight()
+    beside = figure.add_axes((1 - 0.8 / WIDTH, 0.48 - tall / 2, 0.12 / WIDTH, tall))
+    bar = figure.colorbar(maps[0], cax=beside, extend="both")
+    bar.set_label("mean of |b| − F  (nT)")
+    bar.outline.set_visible(False)
     return figure
 
 
-def _hemisphere(axes: Axes, unit: Array, residual: Array | None, up: bool) -> PathCollection | None:
+def _hemisphere(axes: Axes, unit: Array, residual: Array | None, up: bool) -> AxesImage:
+    from matplotlib.colors import ListedColormap
+    from matplotlib.patches import Circle
+
     here = np.isfinite(unit).all(axis=1) & ((unit[:, 2] >= 0) == up)
-    if not here.any():
-        return None
-    values = np.full(int(here.sum()), np.nan) if residual is None else residual[here]
-    place, mean = cell_means(disc(unit[here]), values)
-    look: dict[str, Any] = {"c": colour(0)} if residual is None else {"c": mean, "cmap": "RdBu_r"}
-    return axes.scatter(place[:, 0], place[:, 1], s=9, linewidths=0, rasterized=True, **look)
+    values = np.ones(int(here.sum())) if residual is None else residual[here]
+    look: dict[str, Any] = {"cmap": "RdYlBu_r"} if residual is not None else {"cmap": ListedColormap([colour(0)])}
+    image = axes.imshow(
+        cell_means(disc(unit[here]), values),
+        origin="lower", extent=(-1, 1, -1, 1), interpolation="none", zorder=2, **look,
+    )  # fmt: skip
+    axes.set_xlim(-1.12, 1.12)  # the image had set its own
+    axes.set_ylim(-1.12, 1.12)
+    image.set_clip_path(Circle((0, 0), 1.0, transform=axes.transData))
+    return image
 
 
 def _globe(axes: Axes) -> None:
     from matplotlib.patches import Circle
 
-    axes.set_aspect("equal")
-    axes.set_xlim(-1.12, 1.12)
-    axes.set_ylim(-1.12, 1.12)
     axes.set_axis_off()
-    axes.add_patch(Circle((0, 0), 1.0, facecolor=WASH, edgecolor=MUTED, linewidth=0.8, zorder=0))
+    axes.add_patch(Circle((0, 0), 1.0, facecolor=GRID, edgecolor=MUTED, linewidth=0.8, zorder=0))
+    line: dict[str, Any] = {"color": MUTED, "linewidth": 0.5, "alpha": 0.45, "zorder": 3}
     for ring in RINGS:
         radius = np.sqrt(1 - np.sin(np.radians(ring)))
-        axes.add_patch(Circle((0, 0), radius, fill=False, edgecolor=GRID, linewidth=0.7, zorder=0.5))
-    axes.plot([-1, 1], [0, 0], color=GRID, linewidth=0.7, zorder=0.5)
-    axes.plot([0, 0], [-1, 1], color=GRID, linewidth=0.7, zorder=0.5)
+        axes.add_patch(Circle((0, 0), radius, fill=False, **line))
+    axes.plot([-1, 1], [0, 0], **line)
+    axes.plot([0, 0], [-1, 1], **line)
     axes.text(1.03, 0, "x", va="center", color=MUTED, fontsize=8)
     axes.text(0, 1.03, "y", ha="center", color=MUTED, fontsize=8)
 
@@ -93,14 +99,13 @@ def against_direction(unit: Array, residual: Array, sensors: list[str]) -> Figur
 
     Args: as for `coverage`, `residual` not None.
     """
-    figure = new_figure(3.0)
-    panels = figure.subplots(1, 2, sharey=True)
+    figure, grid = panels(1, 2, 2.15, top=legend_height(sensors) - 0.2, gap=0.3, sharey=True)
     azimuth = np.degrees(np.arctan2(unit[..., 1], unit[..., 0]))
     elevation = np.degrees(np.arcsin(np.clip(unit[..., 2], -1.0, 1.0)))
     handles = []
     for axes, angle, edges, words in (
-        (panels[0], azimuth, AZIMUTHS, "azimuth of the field from x towards y  (deg)"),
-        (panels[1], elevation, ELEVATIONS, "elevation of the field towards z  (deg)"),
+        (grid[0, 0], azimuth, AZIMUTHS, "azimuth of the field from x towards y  (deg)"),
+        (grid[0, 1], elevation, ELEVATIONS, "elevation of the field towards z  (deg)"),
     ):
         shift = 0.5 * (edges[1] - edges[0]) / max(len(sensors), 1)
         for i in range(len(sensors)):
@@ -110,12 +115,12 @@ def against_direction(unit: Array, residual: Array, sensors: list[str]) -> Figur
                 at, found.mean, 2 * found.error, color=colour(i), linewidth=0.9, marker="o", markersize=2.6,
                 elinewidth=0.8,
             )  # fmt: skip
-            if axes is panels[0]:
+            if axes is grid[0, 0]:
                 handles.append(drawn)
         axes.axhline(0.0, color=INK, linewidth=0.5)
         axes.set_xlabel(words)
         axes.set_xlim(edges[0], edges[-1])
         axes.set_xticks(edges[:: 6 if len(edges) > 20 else 3])
-    panels[0].set_ylabel("mean |b| − F  (nT)")
+    grid[0, 0].set_ylabel("mean |b| − F  (nT)")
     legend(figure, handles, sensors)
     return figure

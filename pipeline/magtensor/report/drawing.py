@@ -35,6 +35,8 @@ DARK = {
 FONTS = "system-ui,'Segoe UI','Helvetica Neue',Arial,'DejaVu Sans',sans-serif"
 MEANS_PER_COLUMN = 4  # a slow change shows better in fewer, quieter means
 WIDTH = 10.6  # inches, of a picture as wide as the page
+LEFT, RIGHT, BOTTOM, TITLE = 0.78, 0.12, 0.46, 0.24  # inches of the margins and above each axes
+LEGEND_COLUMNS = 7
 MOST_SENSORS = 12  # rows of a picture
 STYLE: dict[Any, Any] = {
     "svg.fonttype": "none", "svg.hashsalt": "magtensor", "text.parse_math": False, "font.size": 8.5,
@@ -101,16 +103,36 @@ def _scheme() -> str:
     return f"@media screen and (prefers-color-scheme:dark){{:root{{{dark}}}}}"
 
 
-def new_figure(height: float, width: float = WIDTH) -> Figure:
-    """An empty figure of the page's width, laid out without pyplot."""
+def panels(
+    rows: int, columns: int, row_height: float, *, top: float = 0.06, gap: float = 0.85, between: float = 0.12,
+    **options: Any,
+) -> tuple[Figure, Any]:  # fmt: skip
+    """A figure of the page's width with a grid of axes, laid out by rule: no drawing is needed to place anything.
+
+    Args:
+        rows, columns: of the grid.
+        row_height: inches of an axes' height; a title stands above each.
+        top: inches kept free for a legend.
+        gap: inches between columns; between: inches between rows, beside the room for a title.
+        options: for `Figure.subplots`.
+
+    Returns:
+        the figure and the axes (rows, columns).
+    """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure as NewFigure
-    from matplotlib.layout_engine import ConstrainedLayoutEngine
 
-    layout = ConstrainedLayoutEngine(w_pad=0.06, h_pad=0.05, hspace=0.03, wspace=0.03)
-    figure = NewFigure(figsize=(width, height), layout=layout, dpi=96)
+    step = row_height + TITLE + between
+    height = top + rows * step - between + BOTTOM
+    figure = NewFigure(figsize=(WIDTH, height), dpi=96)
     FigureCanvasAgg(figure)
-    return figure
+    inner = WIDTH - LEFT - RIGHT
+    across = (inner - gap * (columns - 1)) / columns
+    grid = {
+        "left": LEFT / WIDTH, "right": 1 - RIGHT / WIDTH, "bottom": BOTTOM / height, "top": 1 - (top + TITLE) / height,
+        "wspace": gap / across, "hspace": (TITLE + between) / row_height,
+    }  # fmt: skip
+    return figure, figure.subplots(rows, columns, squeeze=False, gridspec_kw=grid, **options)
 
 
 def label(text: str, most: int = 28) -> str:
@@ -162,7 +184,7 @@ def decades(axis: Axis) -> None:
     low, high = sorted(axis.get_view_interval())
     between = (1.0, 2.0, 5.0) if high < 30 * low else (1.0,)
     axis.set_major_locator(LogLocator(subs=between, numticks=12))
-    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.3g}" if 1e-4 <= value < 1e5 else f"{value:.0e}"))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}" if 1e-4 <= value < 1e6 else f"{value:.0e}"))
     axis.set_minor_formatter(NullFormatter())
 
 
@@ -173,4 +195,13 @@ def nothing(axes: Axes, words: str) -> None:
 
 def legend(figure: Figure, handles: Sequence[Any], names: Sequence[str]) -> None:
     """One legend above all panels."""
-    figure.legend(handles, [label(n) for n in names], loc="outside upper right", ncols=min(len(names), 8))
+    columns = min(len(names), LEGEND_COLUMNS)
+    figure.legend(
+        handles, [label(n, 18) for n in names], loc="upper right", ncols=columns, borderaxespad=0.2,
+        bbox_to_anchor=(1 - RIGHT / WIDTH, 1.0),
+    )  # fmt: skip
+
+
+def legend_height(names: Sequence[str]) -> float:
+    """Inches that `legend` takes."""
+    return 0.12 + 0.18 * -(-len(names) // LEGEND_COLUMNS)

@@ -9,7 +9,7 @@ import numpy as np
 
 from magtensor.calibration.types import Array
 from magtensor.report.clock import clock
-from magtensor.report.drawing import WASH, colour, label, new_figure
+from magtensor.report.drawing import WASH, WIDTH, colour, label, panels
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -43,8 +43,9 @@ def ribbon(time: Array, units: str, flags: Sequence[Mapping[str, Any]], sensors:
     rows = ["", *sensors] if any(not f["sensor"] for f in flags) else list(sensors)
     known = reasons(flags)
     axis = clock(time, units)
-    figure = new_figure(0.75 + 0.24 * len(rows) + 0.2 * min(len(known), MOST_REASONS))
-    axes = figure.subplots()
+    figure, grid = panels(1, 1, 0.24 * len(rows), top=0.2 * min(len(known), MOST_REASONS))
+    figure.subplots_adjust(left=1.6 / WIDTH)
+    axes = grid[0, 0]
     end = float(axis.values[-1]) if len(axis.values) else 0.0
     span = end if end > 0 else 1.0
     for row, sensor in enumerate(rows):
@@ -62,7 +63,7 @@ def ribbon(time: Array, units: str, flags: Sequence[Mapping[str, Any]], sensors:
     axes.set_xlabel(axis.label)
     shown = [*known[: MOST_REASONS - 1], "other reasons"] if len(known) > MOST_REASONS else known
     handles = [Line2D([], [], color=colour(k), linewidth=5, solid_capstyle="butt") for k in range(len(shown))]
-    figure.legend(handles, [label(s, 110) for s in shown], loc="outside upper left", ncols=1)
+    figure.legend(handles, [label(s, 110) for s in shown], loc="upper left", ncols=1, borderaxespad=0.2)
     return figure
 
 

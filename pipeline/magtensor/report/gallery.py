@@ -183,8 +183,9 @@ def _attitude_pictures(content: Content, use: Arrays) -> list[Picture | Gap]:
     ]  # fmt: skip
     if residual is not None:
         caption = (
-            "Means over slices of direction, with two standard errors that take the samples as independent. A wave "
-            "here is a calibration error: noise has no direction."
+            "Means over slices of direction, with two standard errors that take the samples as independent. Noise "
+            "has no direction: what stands off zero by more than its bar is an error that goes with the attitude, or "
+            "one that was there while the field pointed so."
         )
         found.append(
             picture("What is left against direction", caption + _left_out(use), lambda: (

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from magtensor.calibration.types import Array
-from magtensor.report.drawing import INK, MUTED, colour, decades, label, legend, new_figure, nothing
+from magtensor.report.drawing import INK, MUTED, colour, decades, label, legend, legend_height, nothing, panels
 from magtensor.report.reduction import Spectrum, spectrum, thinned
 
 if TYPE_CHECKING:
@@ -78,16 +78,16 @@ def spectra(found: list[Curves], step: float, sensors: list[str]) -> Figure:
     """
     from matplotlib.lines import Line2D
 
-    figure = new_figure(3.3)
-    panels = figure.subplots(1, len(found), squeeze=False)[0]
-    for axes, shown in zip(panels, found, strict=True):
+    names = [*sensors, "white noise"]
+    figure, grid = panels(1, len(found), 2.3, top=legend_height(names) - 0.1)
+    for axes, shown in zip(grid[0], found, strict=True):
         _spectrum_panel(axes, shown.of, shown.noise * np.sqrt(2 * step * shown.summed))
         axes.set_title(shown.words)
         axes.set_xlabel("frequency  (Hz)")
-    panels[0].set_ylabel("nT / √Hz")
+    grid[0, 0].set_ylabel("nT / √Hz")
     handles = [Line2D([], [], color=colour(i), linewidth=2) for i in range(len(sensors))]
     floor = Line2D([], [], color=MUTED, linewidth=1.2, linestyle=(0, (4, 3)))
-    legend(figure, [*handles, floor], [*sensors, "white noise"])
+    legend(figure, [*handles, floor], names)
     return figure
 
 
@@ -112,16 +112,15 @@ def histograms(residual: Array, sensors: list[str]) -> Figure:
     """
     across = min(len(sensors), 4)
     rows = -(-len(sensors) // across)
-    figure = new_figure(0.4 + 2.1 * rows)
-    panels = figure.subplots(rows, across, squeeze=False).ravel()
-    for i, axes in enumerate(panels):
+    figure, grid = panels(rows, across, 1.5, gap=0.5, between=0.42)
+    for i, axes in enumerate(grid.ravel()):
         if i >= len(sensors):
             axes.set_axis_off()
             continue
         _histogram(axes, residual[:, i], i)
         axes.set_title(label(sensors[i], 18))
         axes.set_xlabel("|b| − F  (nT)")
-    for axes in panels[::across]:
+    for axes in grid[:, 0]:
         axes.set_ylabel("samples")
     return figure
 

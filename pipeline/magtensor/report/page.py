@@ -81,7 +81,8 @@ def facts(content: Content) -> dict[str, Any]:
         "recipe_text": _yaml(recipe),
         "survey_facts": survey_facts(content),
         "sentence": _sentence(content),
-        "outcome": content.outcome or {},
+        "found": {"adopted": [], "rejected": [], "not_tested": [], **(content.outcome or {})},
+        "unexplained": _unexplained(content),
         "errors": tables.errors(content),
         "judgements": judgements,
         "counts": [(s, sum(j.state == s for j in judgements)) for s in tables.ORDER],
@@ -123,6 +124,12 @@ def survey_facts(content: Content) -> list[tuple[str, str]]:
         if step > 0:
             shown.append(("rate", f"{number(1 / step)} Hz" if step < 1 else f"one in {number(step)} s"))
     return shown
+
+
+def _unexplained(content: Content) -> Mapping[str, Any] | None:
+    """What the loop could not explain, where it looked and found something."""
+    said = (content.outcome or {}).get("unexplained") or {}
+    return said if said.get("present") else None
 
 
 def _sentence(content: Content) -> str:

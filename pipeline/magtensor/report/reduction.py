@@ -9,6 +9,7 @@ import numpy as np
 from magtensor.calibration.types import Array
 
 COLUMNS = 600  # about what a page resolves
+CELLS = 48  # across a hemisphere: some 2 deg at its pole
 GAP = 5.0  # sampling intervals after which a line is broken
 
 
@@ -156,25 +157,24 @@ def disc(direction: Array) -> Array:
     return np.asarray(radius[:, None] * unit)
 
 
-def cell_means(points: Array, values: Array, cells: int = 56) -> tuple[Array, Array]:
-    """Points (N, 2) in the unit disc gathered by square cells.
+def cell_means(points: Array, values: Array, cells: int = CELLS) -> Array:
+    """Means over square cells of the square around the unit disc.
 
     Args:
-        points: finite.
+        points: (N, 2) in the disc, finite.
         values: (N,), NaN ignored.
         cells: across the disc.
 
     Returns:
-        points (M, 2): the mean place of each occupied cell; values (M,): their mean, NaN where none is known.
+        (cells, cells), first index along y; NaN where no value is known.
     """
-    index = np.clip(((points + 1.0) * 0.5 * cells).astype(np.int64), 0, cells - 1)
-    _, cell = np.unique(index[:, 0] * cells + index[:, 1], return_inverse=True)
-    count = np.bincount(cell)
-    place = np.column_stack([np.bincount(cell, points[:, k]) / count for k in range(2)])
+    column, row = np.clip(((points + 1.0) * 0.5 * cells).astype(np.int64), 0, cells - 1).T
     known = np.isfinite(values)
-    weight = np.bincount(cell, known)
-    total = np.bincount(cell, np.where(known, values, 0.0))
-    return place, np.divide(total, weight, out=np.full(len(count), np.nan), where=weight > 0)
+    cell = (row * cells + column)[known]
+    count = np.bincount(cell, minlength=cells**2)
+    total = np.bincount(cell, values[known], minlength=cells**2)
+    mean = np.divide(total, count, out=np.full(cells**2, np.nan), where=count > 0)
+    return np.asarray(mean.reshape(cells, cells))
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,20 @@ import numpy as np
 from magtensor.accuracy import COMPONENTS
 from magtensor.calibration.types import Array
 from magtensor.report.clock import Clock, clock
-from magtensor.report.drawing import INK, MUTED, WASH, around, colour, label, legend, new_figure, nothing, trace
+from magtensor.report.drawing import (
+    INK,
+    MUTED,
+    WASH,
+    WIDTH,
+    around,
+    colour,
+    label,
+    legend,
+    legend_height,
+    nothing,
+    panels,
+    trace,
+)  # fmt: skip
 from magtensor.report.reduction import COLUMNS
 
 if TYPE_CHECKING:
@@ -31,8 +44,8 @@ def total_field_residual(
         sensors: S names.
     """
     count = len(sensors)
-    figure = new_figure(0.45 + 1.25 * count)
-    grid = figure.subplots(count, 2, squeeze=False, sharex=True, width_ratios=(4.2, 1.0))
+    figure, grid = panels(count, 2, 0.9, gap=0.2, sharex=True, width_ratios=(4.2, 1.0))
+    figure.subplots_adjust(right=1 - 0.6 / WIDTH)
     axis = clock(time, units)
     for i, (main, small) in enumerate(grid):
         if np.isfinite(noise[i]):
@@ -63,10 +76,9 @@ def contrast(time: Array, units: str, values: Array, noise: Array, sensors: list
         values: (N, S, 3) nT, NaN where not in use.
         noise: (S,) nT what noise alone makes of each contrast.
     """
-    figure = new_figure(0.6 + 1.15 * len(sensors))
-    panels = figure.subplots(len(sensors), 1, squeeze=False, sharex=True)[:, 0]
+    figure, grid = panels(len(sensors), 1, 0.85, top=legend_height(AXIS) - 0.1, sharex=True)
     axis = clock(time, units)
-    for i, axes in enumerate(panels):
+    for i, axes in enumerate(grid[:, 0]):
         if np.isfinite(noise[i]):
             axes.axhspan(-2 * noise[i], 2 * noise[i], color=WASH, zorder=0)
         for k in range(3):
@@ -75,7 +87,7 @@ def contrast(time: Array, units: str, values: Array, noise: Array, sensors: list
         axes.set_title(label(sensors[i]))
         axes.set_ylabel("nT")
     legend(figure, _swatches(3), AXIS)
-    _label_time(panels[-1], axis)
+    _label_time(grid[-1, 0], axis)
     return figure
 
 
@@ -85,30 +97,28 @@ def tensor(time: Array, units: str, values: Array, std: Array | None) -> Figure:
     Args:
         values: (N, 3, 3) nT/m, NaN where not in use; std: the same shape, or None.
     """
-    figure = new_figure(5.6)
-    panels = figure.subplots(3, 2, sharex=True).T.ravel()
+    figure, grid = panels(3, 2, 1.35, sharex=True)
     axis = clock(time, units)
-    for i, (axes, name) in enumerate(zip(panels, COMPONENTS, strict=True)):
+    for i, (axes, name) in enumerate(zip(grid.T.ravel(), COMPONENTS, strict=True)):
         row, column = (AXIS.index(c) for c in name)
         _with_band(axes, axis, values[:, row, column], None if std is None else std[:, row, column], colour(i))
         axes.set_title(f"B{name}")
         axes.set_ylabel("nT/m")
-    for axes in (panels[2], panels[5]):
+    for axes in grid[-1]:
         _label_time(axes, axis)
     return figure
 
 
 def closure(time: Array, units: str, values: Array, names: list[str]) -> Figure:
     """What Maxwell's equations make zero, as far as it was measured. `values`: (N, K) nT/m of the `names`."""
-    figure = new_figure(0.45 + 1.15 * len(names))
-    panels = figure.subplots(len(names), 1, squeeze=False, sharex=True)[:, 0]
+    figure, grid = panels(len(names), 1, 0.85, sharex=True)
     axis = clock(time, units)
-    for i, (axes, name) in enumerate(zip(panels, names, strict=True)):
+    for i, (axes, name) in enumerate(zip(grid[:, 0], names, strict=True)):
         trace(axes, axis.values, values[:, i], colour(i))
         axes.axhline(0.0, color=INK, linewidth=0.5)
         axes.set_title(label(name))
         axes.set_ylabel("nT/m")
-    _label_time(panels[-1], axis)
+    _label_time(grid[-1, 0], axis)
     return figure
 
 
@@ -119,17 +129,16 @@ def invariants(time: Array, units: str, values: Array, std: Array | None, names:
         values: (N, K); std: the same shape, or None; names: K; of: their K units.
     """
     rows = (len(names) + 1) // 2
-    figure = new_figure(0.5 + 1.5 * rows)
-    panels = figure.subplots(rows, 2, squeeze=False, sharex=True).ravel()
+    figure, grid = panels(rows, 2, 1.15, sharex=True)
     axis = clock(time, units)
-    for i, axes in enumerate(panels):
+    for i, axes in enumerate(grid.ravel()):
         if i >= len(names):
             axes.set_axis_off()
             continue
         _with_band(axes, axis, values[:, i], None if std is None else std[:, i], colour(i))
         axes.set_title(label(names[i]))
         axes.set_ylabel(label(of[i]))
-    for axes in panels[-2:]:
+    for axes in grid[-1]:
         _label_time(axes, axis)
     return figure
 
@@ -137,14 +146,13 @@ def invariants(time: Array, units: str, values: Array, std: Array | None, names:
 def reference(time: Array, units: str, total_field: Array | None, diurnal: Array | None) -> Figure:
     """The total field the sensors were held against, and the diurnal variation taken off. (N,) nT each."""
     shown = [(v, w) for v, w in ((total_field, "total field F"), (diurnal, "diurnal variation")) if v is not None]
-    figure = new_figure(0.5 + 1.4 * len(shown))
-    panels = figure.subplots(len(shown), 1, squeeze=False, sharex=True)[:, 0]
+    figure, grid = panels(len(shown), 1, 1.05, sharex=True)
     axis = clock(time, units)
-    for i, (axes, (values, words)) in enumerate(zip(panels, shown, strict=True)):
+    for i, (axes, (values, words)) in enumerate(zip(grid[:, 0], shown, strict=True)):
         trace(axes, axis.values, values, colour(i))
         axes.set_title(words)
         axes.set_ylabel("nT")
-    _label_time(panels[-1], axis)
+    _label_time(grid[-1, 0], axis)
     return figure
 
 
