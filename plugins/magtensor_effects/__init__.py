@@ -1,1 +1,48 @@
-"""Built-in error models."""
+"""Built-in error models: the catalogue of docs/error_models.md."""
+
+from magtensor_effects.ageing import offset_drift, offset_step, scale_drift, warm_up
+from magtensor_effects.channels import channel_response, moving_part, periodic_interference
+from magtensor_effects.geometry import baseline_expansion, finite_baseline, position_error
+from magtensor_effects.inertia import bandwidth, clock_drift, eddy_current, sampling_lag, viscous_magnetisation
+from magtensor_effects.mechanics import crosstalk, frame_flexure
+from magtensor_effects.power import current_field, supply_offset, supply_scale
+from magtensor_effects.reference import reference_clock, reference_scale, reference_step
+from magtensor_effects.site import fixed_source, passing_source, site_gradient
+from magtensor_effects.temperature import temperature_offset, temperature_rate, temperature_scale
+from magtensor_effects.transfer import cross_field, hysteresis, nonlinearity_cubic, nonlinearity_quadratic
+
+__all__ = [
+    "bandwidth",
+    "baseline_expansion",
+    "channel_response",
+    "clock_drift",
+    "cross_field",
+    "crosstalk",
+    "current_field",
+    "eddy_current",
+    "finite_baseline",
+    "fixed_source",
+    "frame_flexure",
+    "hysteresis",
+    "moving_part",
+    "nonlinearity_cubic",
+    "nonlinearity_quadratic",
+    "offset_drift",
+    "offset_step",
+    "passing_source",
+    "periodic_interference",
+    "position_error",
+    "reference_clock",
+    "reference_scale",
+    "reference_step",
+    "sampling_lag",
+    "scale_drift",
+    "site_gradient",
+    "supply_offset",
+    "supply_scale",
+    "temperature_offset",
+    "temperature_rate",
+    "temperature_scale",
+    "viscous_magnetisation",
+    "warm_up",
+]

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from fnmatch import fnmatchcase
+from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +16,7 @@ from magtensor.errors import did_you_mean
 from magtensor.loop.terms import REFERENCE, Terms
 
 AXES = "xyz"
+VECTORS = ("acceleration", "angular_rate")  # channels with a value for each axis whatever the number of sensors
 
 
 @dataclass(frozen=True)
@@ -48,7 +51,7 @@ class Excitation:
     segment: NDArray[np.int_]
     position: Array | None = None
     attitude: Array | None = None
-    lines: Sequence[float] = field(default_factory=tuple)
+    lines: Sequence[float] = ()
 
     @property
     def duration(self) -> float:
@@ -76,6 +79,61 @@ class Excitation:
             raise KeyError(f"no channel {name}{did_you_mean(name, self.logged)}")
         return self.logged[name]
 
+    def is_vector(self, name: str) -> bool:
+        """Whether a logged channel has a value for each axis rather than one, or one for each sensor."""
+        shape = self.channel(name).shape
+        return len(shape) == 2 and shape[1] == 3 and (len(self.sensors) != 3 or name in VECTORS)
+
+    @cached_property
+    def uniform(self) -> bool:
+        """Whether all sensors see one field."""
+        return bool(np.array_equal(self.field, np.broadcast_to(self.field[:, :1], self.field.shape)))
+
+    @property
+    def field_or_fields(self) -> Array:
+        """(N, 3) nT where all sensors see one field, else (N, S, 3)."""
+        return self.field[:, 0] if self.uniform else self.field
+
+    @cached_property
+    def matrix(self) -> Array:
+        """C (S, 3, 3) of each sensor, from output = C field + o.
+
+        A field that stays in a plane shows only a part of it; the rest is that of the unit matrix.
+        """
+        b = self.field - self.field.mean(axis=0)
+        beyond = self.output - self.output.mean(axis=0) - b
+        grams = np.einsum("nsi,nsj->sij", b, b)
+        mixed = np.einsum("nsi,nsj->sij", b, beyond)
+        out: Array = np.eye(3) + np.swapaxes(np.linalg.pinv(grams, rcond=1e-9, hermitian=True) @ mixed, 1, 2)
+        return out
+
+    def sensed(self, vectors: Array) -> Array:
+        """C v (N, S, 3): what the sensors make of a vector (N, 3), or one for each sensor, in the common frame."""
+        each = vectors[:, None] if vectors.ndim == 2 else vectors
+        out: Array = np.einsum("sij,nsj->nsi", self.matrix, np.broadcast_to(each, self.output.shape))
+        return out
+
+    @cached_property
+    def gradient(self) -> Array:
+        """(N, 3, 3) nT/m, [i, j] = dB_i / dx_j, by least squares from the field at the sensors; 0 in a uniform field.
+
+        Of an array that cannot determine it the smallest that fits.
+
+        Raises:
+            KeyError: the positions are not known.
+        """
+        from magtensor.tensor.elements import full
+        from magtensor.tensor.geometry import array_design, array_radius
+
+        if self.position is None:
+            raise KeyError("the survey has no positions, so the field has no known gradient")
+        solver = np.linalg.pinv(array_design(self.position, "gradient"))[3:8] / (array_radius(self.position) or 1.0)
+        return full(self.field.reshape(len(self.time), -1) @ solver.T)
+
+    def lagged(self, series: Array, tau: float) -> Array:
+        """As `relaxed`, but straight across gaps: for what goes on between recordings, such as a temperature."""
+        return _first_order(self.time, np.asarray(series, dtype=float), tau) if tau > 0 else series
+
     def relaxed(self, series: Array, tau: float) -> Array:
         """A series (N, ...) seen through a first-order lag tau, s, exact for samples joined by straight lines.
 
@@ -102,7 +160,7 @@ class Excitation:
         """(first, one past last) sample of each contiguous run."""
         edges = np.flatnonzero(np.diff(self.run)) + 1
         bounds = [0, *edges.tolist(), len(self.run)]
-        return list(zip(bounds[:-1], bounds[1:], strict=True))
+        return list(pairwise(bounds))
 
     # The ways in which effects act.
 
@@ -154,10 +212,12 @@ class Excitation:
 
     def on_reference(self, series: Array, units: str, name: str) -> Terms:
         """One coefficient for a series (N,) that the reference total field holds."""
-        index = np.zeros(1, dtype=int)
-        return Terms((name,), ("",), (units,), np.asarray(series, dtype=float)[:, None], index, index + REFERENCE, index)
+        columns, index = np.asarray(series, dtype=float)[:, None], np.zeros(1, dtype=int)
+        return Terms((name,), ("",), (units,), columns, index, index + REFERENCE, index)
 
-    def _single(self, columns: Array, outputs: NDArray[np.int_], index: NDArray[np.int_], units: str, name: str) -> Terms:
+    def _single(
+        self, columns: Array, outputs: NDArray[np.int_], index: NDArray[np.int_], units: str, name: str
+    ) -> Terms:
         return Terms(
             tuple(f"{name}{AXES[o % 3]}" for o in outputs),
             tuple(self.sensors[o // 3] for o in outputs),
@@ -187,11 +247,30 @@ def _first_order(time: Array, series: Array, tau: float) -> Array:
         tail = lfilter([1.0], [1.0, -decay], driven[1:], axis=0, zi=np.asarray(state, dtype=float))[0]
         out: Array = np.concatenate([series[:1], tail])
         return out
-    out = np.array(series, dtype=float)
-    decays = np.exp(-step / tau)
-    ramps = 1.0 - (1.0 - decays) * tau / step
-    for k in range(1, len(out)):
-        out[k] = decays[k - 1] * out[k - 1] + ramps[k - 1] * series[k] + (1 - decays[k - 1] - ramps[k - 1]) * series[k - 1]
+    decays: Array = np.exp(-step / tau)
+    ramps: Array = 1.0 - (1.0 - decays) * tau / step
+    shape = (-1, *[1] * (series.ndim - 1))
+    driven = ramps.reshape(shape) * series[1:] + (1.0 - decays - ramps).reshape(shape) * series[:-1]
+    return _recursion(np.concatenate([[1.0], decays]), np.concatenate([series[:1], driven]))
+
+
+def _recursion(decay: Array, drive: Array) -> Array:
+    """y[k] = decay[k] y[k - 1] + drive[k] from y = drive[0], in about 2 sqrt(N) steps: affine maps compose."""
+    n = len(decay)
+    length = max(1, int(np.sqrt(n)))
+    blocks = -(-n // length)
+    factor = np.ones(blocks * length)
+    value = np.zeros((blocks * length, *drive.shape[1:]))
+    factor[1:n], value[:n] = decay[1:], drive
+    factors, values = factor.reshape(blocks, length), value.reshape(blocks, length, -1)
+    for i in range(1, length):
+        values[:, i] += factors[:, i, None] * values[:, i - 1]
+        factors[:, i] *= factors[:, i - 1]
+    carry = np.zeros(values.shape[2])
+    for block in range(blocks):
+        values[block] += factors[block, :, None] * carry
+        carry = values[block, -1].copy()
+    out: Array = values.reshape(blocks * length, *drive.shape[1:])[:n]
     return out
 
 

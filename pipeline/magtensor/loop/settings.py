@@ -44,14 +44,64 @@ class Range:
 
 @dataclass(frozen=True)
 class AnyChannel:
-    """The logged channels whose names fit a pattern, those of `without` left out."""
+    """The logged channels whose names fit a pattern or that have certain units, those of `without` left out.
+
+    Attributes:
+        pattern: for the names.
+        without: patterns for names that are left out.
+        or_units: channels in units of this dimension fit whatever their name.
+        vectors: channels with a value for each axis fit too.
+    """
 
     pattern: str
     without: tuple[str, ...] = ()
+    or_units: str = ""
+    vectors: bool = True
 
     def values(self, x: Excitation) -> list[Any]:
         """The names of the channels a survey has."""
-        return x.channels_like(self.pattern, self.without)
+        found = set(x.channels_like(self.pattern, self.without))
+        if self.or_units:
+            found |= {n for n in x.channels_like("*", self.without) if _alike(x.units.get(n, ""), self.or_units)}
+        return sorted(n for n in found if self.vectors or not x.is_vector(n))
+
+    def pick(self, x: Excitation, name: str) -> str:
+        """The channel of that name; where it is "", the only one that fits.
+
+        Raises:
+            DataError: no channel of that name, or not exactly one fits.
+        """
+        from magtensor.errors import DataError, did_you_mean
+
+        if name:
+            if name not in x.logged:
+                raise DataError(
+                    f"no channel {name!r}{did_you_mean(name, x.logged)}",
+                    hint=f"the survey has {', '.join(sorted(x.logged)) or 'none'}",
+                )
+            return name
+        fitting = self.values(x)
+        if len(fitting) != 1:
+            raise DataError(
+                f"{len(fitting)} channels fit {self.pattern!r}: {', '.join(fitting) or 'none'}",
+                hint="name the channel in the recipe",
+            )
+        return str(fitting[0])
+
+
+def _alike(units: str, other: str) -> bool:
+    from magtensor.units import dimension, is_unit
+
+    return is_unit(units) and dimension(units) == dimension(other)
+
+
+@dataclass(frozen=True)
+class Duration:
+    """A time that is the survey's own duration, s: kept with the model, so that it means the same on another survey."""
+
+    def values(self, x: Excitation) -> list[Any]:
+        """The survey's duration."""
+        return [x.duration]
 
 
 @dataclass(frozen=True)

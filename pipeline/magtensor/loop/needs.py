@@ -1,0 +1,52 @@
+"""Whether a survey has what an error model needs.
+
+A need is the name of a channel (`acceleration`, `current_*`), a fact of the survey (`attitude`, `position`,
+`total_field`, `rotation`, `gradient`), or several of these of which one will do (`acceleration|attitude`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from magtensor.components import Component
+from magtensor.loop.excitation import Excitation
+from magtensor.loop.settings import AnyChannel
+
+LARGEST_TURN = 0.5  # rad between neighbouring samples above which rates of change mean nothing
+SMALLEST_TURN = 1e-6  # rad between neighbouring samples below which nothing turns
+
+
+def _turns(x: Excitation) -> bool:
+    """Whether the field turns, and slowly enough between the samples of a run for its rate to be known."""
+    together = np.diff(x.run) == 0
+    if not together.any():
+        return False
+    b = x.field[:, 0]
+    change = np.linalg.norm(np.diff(b, axis=0)[together], axis=1)
+    typical = float(np.sqrt(np.mean(change**2)) / np.sqrt(np.mean(b**2) * 3))
+    return SMALLEST_TURN < typical < LARGEST_TURN
+
+
+FACTS: dict[str, Callable[[Excitation], bool]] = {
+    "attitude": lambda x: x.attitude is not None,
+    "position": lambda x: x.position is not None,
+    "total_field": lambda x: x.total_field is not None,
+    "rotation": _turns,
+    "gradient": lambda x: not x.uniform,
+}
+
+
+def missing(component: Component, x: Excitation) -> list[str]:
+    """The needs of an error model that a survey does not meet, as the model words them."""
+    notes = [m for p in component.parameters.values() for m in getattr(p.annotation, "__metadata__", ())]
+    markers = [m for m in notes if isinstance(m, AnyChannel)]
+
+    def met(need: str) -> bool:
+        if need in FACTS:
+            return FACTS[need](x)
+        return bool(x.channels_like(need)) or any(m.pattern == need and m.values(x) for m in markers)
+
+    declares = component.declared({})
+    return [need for need in declares.needs if not any(met(option) for option in need.split("|"))]

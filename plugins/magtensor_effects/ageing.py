@@ -1,0 +1,83 @@
+"""Error models of time: drifts, warming up, jumps."""
+
+from typing import Annotated
+
+import numpy as np
+from pydantic import Field
+
+from magtensor.calibration.types import Array
+from magtensor.components import error_model
+from magtensor.loop.excitation import Excitation
+from magtensor.loop.settings import Choice, Duration, EventTimes, Range
+from magtensor.loop.terms import Terms, joined
+
+Order = Annotated[int, Choice((1, 2, 3)), Field(ge=1, le=3, description="highest power of time")]
+Span = Annotated[
+    float,
+    Duration(),
+    Field(gt=0, description="time from the start over which the course is known, s; later it stays as at the end"),
+]
+
+
+def _courses(x: Excitation, order: int, span_s: float) -> list[Array]:
+    """Legendre polynomials 1 to `order` of time, from -1 at the start to 1 after span_s."""
+    u = np.clip(2.0 * x.elapsed / span_s - 1.0, -1.0, 1.0)
+    return [np.polynomial.legendre.Legendre.basis(k)(u) for k in range(1, order + 1)]
+
+
+@error_model("instrument", source="METHODS A3, 6", typical="some nT/h after switch-on, fluxgate zero drift")
+def offset_drift(x: Excitation, *, order: Order = 1, span_s: Span = 3600.0) -> Terms:
+    """Each axis's offset drifts with time.
+
+    Legendre polynomials of time over span_s: the coefficient of P1 is half the change from the start to the end.
+    One coefficient an axis and order. A drift is not predicted beyond span_s. Rivals: whatever else changes steadily
+    with time (`warm_up`, `temperature_offset`); `scale_drift` where the attitude hardly changes.
+    """
+    courses = _courses(x, order, span_s)
+    return joined([x.offsets(c, "nT", f"P{k} ") for k, c in enumerate(courses, start=1)])
+
+
+@error_model(
+    "instrument", source="METHODS A3, 7", typical="-79 ppm/yr (Swarm), as the logarithm of time (CHAMP) after launch"
+)
+def scale_drift(x: Excitation, *, order: Order = 1, span_s: Span = 3600.0) -> Terms:
+    """Each axis's scale factor drifts with time.
+
+    Legendre polynomials of time over span_s times the axis's own output: the coefficient of P1 is half the change
+    from the start to the end. Rivals: `reference_scale` where the total field changes steadily; `temperature_scale`.
+    """
+    courses = _courses(x, order, span_s)
+    return joined([x.scales(1e-6 * c, "ppm", f"P{k} ") for k, c in enumerate(courses, start=1)])
+
+
+@error_model("instrument", source="METHODS A3, 8", typical="a few nT over 15 min")
+def warm_up(
+    x: Excitation,
+    *,
+    tau_s: Annotated[
+        float,
+        Range(0.02, 1.0, count=7, spacing="log", of_duration=True),
+        Field(gt=0, description="time constant, s"),
+    ] = 300.0,
+) -> Terms:
+    """Each axis's offset settles exponentially after the electronics were switched on.
+
+    exp(-t / tau_s) with t from the survey's start; a switch-on before that only changes the coefficient, which is
+    what is left at the start. Rivals: `offset_drift` where tau_s is not short against the survey,
+    `temperature_offset` where the electronics' heat reaches the thermometer.
+    """
+    return x.offsets(np.exp(-x.elapsed / tau_s), "nT")
+
+
+@error_model("instrument", source="METHODS A3, 16", typical="1 to 10 nT after a shock, or from one posture to the next")
+def offset_step(
+    x: Excitation,
+    *,
+    time_s: Annotated[float, EventTimes(), Field(description="time of the jump, s since the survey's start")] = 0.0,
+) -> Terms:
+    """Each axis's offset jumps at a time: a core was magnetised by a shock, a connector touched.
+
+    One coefficient an axis; several jumps are several models of this name. Rival: `offset_drift` for a jump in the
+    middle of a short survey.
+    """
+    return x.offsets((x.elapsed >= time_s).astype(float), "nT")

@@ -1,0 +1,85 @@
+"""Error models that follow a logged channel or a tone."""
+
+from typing import Annotated
+
+import numpy as np
+from pydantic import Field
+
+from magtensor.calibration.types import Array
+from magtensor.components import error_model
+from magtensor.loop.excitation import AXES, Excitation
+from magtensor.loop.settings import AnyChannel, Choice, Frequencies, Range
+from magtensor.loop.terms import Terms, joined
+from magtensor.units import convert
+
+ATTITUDE_ANGLES = ("roll*", "pitch*", "yaw*", "heading*", "azimuth*", "course*", "latitude*", "longitude*")
+ENCODER = AnyChannel("encoder*", without=ATTITUDE_ANGLES, or_units="rad", vectors=False)
+ANY = AnyChannel("*")
+
+
+@error_model("instrument", needs=("encoder*",), source="METHODS A3, 24", typical="100 nT for 1 A m2 at 1 m")
+def moving_part(
+    x: Excitation, *, channel: Annotated[str, ENCODER, Field(description="angle channel; '': the only one")] = ""
+) -> Terms:
+    """A magnetised part that turns about an axis on the platform (gimbal, rudder, winch), its angle logged.
+
+    Cosine and sine of the angle, each a constant vector at each sensor: two coefficients an axis. Harmonics of the
+    angle and magnetisation induced in the part are left out. Rival: `current_field` of its motor.
+    """
+    name = ENCODER.pick(x, channel)
+    angle = x.channel(name) * (convert(1.0, x.units[name], "rad") if x.units[name] not in ("", "1") else 1.0)
+    return joined([x.offsets(np.cos(angle), "nT", "cos "), x.offsets(np.sin(angle), "nT", "sin ")])
+
+
+@error_model("instrument", source="METHODS A3, 25", typical="a nT of mains beside buildings; tens from a motor")
+def periodic_interference(
+    x: Excitation,
+    *,
+    frequency_Hz: Annotated[
+        float, Frequencies(), Field(gt=0, description="frequency as it appears in the record, aliased or not, Hz")
+    ] = 50.0,
+) -> Terms:
+    """A tone: mains, a motor, a propeller, as it comes out after sampling.
+
+    Cosine and sine of 2 pi f t with t from the survey's start: two coefficients an axis. The phase belongs to this
+    survey: on another one only amplitude and frequency carry over. Harmonics are models of their own of this name.
+    """
+    turn = 2.0 * np.pi * frequency_Hz * x.elapsed
+    return joined([x.offsets(np.cos(turn), "nT", "cos "), x.offsets(np.sin(turn), "nT", "sin ")])
+
+
+@error_model("instrument", source="DESIGN section 5", typical="unknown: for channels that nobody wrote a model for")
+def channel_response(
+    x: Excitation,
+    *,
+    channel: Annotated[str, ANY, Field(description="any logged channel; '': the only one")] = "",
+    power: Annotated[int, Choice((1, 2, 3)), Field(ge=1, le=3, description="power of the channel")] = 1,
+    lag_s: Annotated[
+        float,
+        Range(0.0, 300.0, count=5, spacing="log"),
+        Field(ge=0, description="time constant of the response behind the channel, s"),
+    ] = 0.0,
+    times_field: Annotated[
+        bool,
+        Choice((False, True)),
+        Field(description="true: it changes the scale factors; false: it adds to the offsets"),
+    ] = False,
+) -> Terms:
+    """The output follows a power of any logged channel, through a lag, as an offset or as a factor.
+
+    The channel's mean is taken off before the power. One coefficient an axis; nine a sensor for a channel with three
+    components. Rivals: the model that names the cause (`temperature_offset`, `current_field`, ...), identical to this
+    one at power 1.
+    """
+    name = ANY.pick(x, channel)
+    course = x.lagged(x.channel(name), lag_s) ** power
+    per_unit = f"({x.units[name]})^{power}" if power > 1 else x.units[name]
+    if not x.is_vector(name):
+        return x.scales(1e-6 * course, f"ppm/{per_unit}") if times_field else x.offsets(course, f"nT/{per_unit}")
+    if times_field:
+        return joined([x.scales(1e-6 * c, f"ppm/{per_unit}", f"{AXES[i]} ") for i, c in enumerate(_columns(course))])
+    return x.matrices(course, f"nT/{per_unit}")
+
+
+def _columns(values: Array) -> list[Array]:
+    return [values[:, i] for i in range(values.shape[1])]

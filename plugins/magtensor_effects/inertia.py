@@ -1,0 +1,102 @@
+"""Error models of rates and delays: what comes late, or follows the change of the field."""
+
+from typing import Annotated
+
+from pydantic import Field
+
+from magtensor.components import error_model
+from magtensor.loop.excitation import Excitation
+from magtensor.loop.settings import Choice, Range
+from magtensor.loop.terms import Terms
+
+
+@error_model(
+    "instrument",
+    needs=("rotation",),
+    source="METHODS A3, 17",
+    typical="25 nT for 1 ms at 0.5 rad/s in 50 000 nT",
+)
+def sampling_lag(
+    x: Excitation,
+    *,
+    per_axis: Annotated[
+        bool, Choice((False, True)), Field(description="true: a delay for each axis; false: one for each sensor")
+    ] = False,
+) -> Terms:
+    """Each sensor, or each axis, is sampled late by a constant time.
+
+    Minus the rate of change of the output; the coefficient is the delay. A delay common to all sensors is a rotation
+    of the field and shows only against a reference. Rivals: `eddy_current`, which contains it; `bandwidth`.
+    """
+    late = -x.derivative(x.output)
+    return x.responses(late, "s", "lag ") if per_axis else x.one_each(late, "s", "lag")
+
+
+@error_model(
+    "instrument",
+    needs=("rotation",),
+    source="METHODS A3, 18; Kotsiaros et al. 2020",
+    typical="25 nT for a plate of time constant 1 ms at 0.5 rad/s",
+)
+def eddy_current(x: Excitation) -> Terms:
+    """Conductors near a sensor shield the change of the field: minus dB/dt through a matrix of each sensor.
+
+    Nine coefficients a sensor: coupling times time constant. The part common to all sensors is a rotation of the
+    field and shows only against a reference. Rivals: `sampling_lag` and `bandwidth`, both contained in it;
+    `viscous_magnetisation` with a short time constant.
+    """
+    return x.matrices(-x.derivative(x.field_or_fields), "s")
+
+
+@error_model("instrument", needs=("rotation",), source="METHODS A3, 19", typical="a ms between axes; small")
+def bandwidth(
+    x: Excitation,
+    *,
+    tau_s: Annotated[
+        float,
+        Range(1e-3, 3.0, count=6, spacing="log"),
+        Field(gt=0, description="time constant that shapes the response, s"),
+    ] = 1e-3,
+) -> Terms:
+    """Each axis is a low-pass filter of its own.
+
+    A filter of time constant tau_s adds -tau_s times its own answer to the output's rate of change; the coefficient
+    is the time constant found. To first order that is a delay, so `sampling_lag` is its rival wherever tau_s is short
+    against the motion.
+    """
+    return x.responses(-x.relaxed(x.derivative(x.output), tau_s), "s")
+
+
+@error_model(
+    "instrument",
+    needs=("rotation",),
+    source="METHODS A3, 20",
+    typical="1 ppm over 1 h is 3.6 ms, 90 nT at 0.5 rad/s",
+)
+def clock_drift(x: Excitation) -> Terms:
+    """Each sensor's logger has a clock of its own that runs fast: a sample stamped t was taken at t (1 + drift).
+
+    Time since the start times the rate of change of the output; one coefficient a sensor. A drift common to all
+    sensors shows only against a reference.
+    """
+    return x.one_each(1e-6 * x.elapsed[:, None, None] * x.derivative(x.output), "ppm", "drift")
+
+
+@error_model("instrument", source="METHODS A3, 23", typical="some 100 ppm of the field beside steel; rarely known")
+def viscous_magnetisation(
+    x: Excitation,
+    *,
+    tau_s: Annotated[
+        float,
+        Range(0.5, 500.0, count=7, spacing="log"),
+        Field(gt=0, description="time constant of the magnetisation, s"),
+    ] = 20.0,
+) -> Terms:
+    """Iron whose magnetisation follows the field late.
+
+    The field through a first-order lag, minus the field, through a matrix of each sensor: nine coefficients, as
+    fractions of the field. Between recordings the field is taken to change steadily. Rivals: `eddy_current` for
+    short time constants, `hysteresis`.
+    """
+    b = x.field_or_fields
+    return x.matrices(1e-6 * (x.lagged(b, tau_s) - b), "ppm")

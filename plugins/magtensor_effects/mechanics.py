@@ -1,0 +1,85 @@
+"""Error models of the frame and of sensors that disturb each other."""
+
+import numpy as np
+
+from magtensor.attitude import into_platform
+from magtensor.calibration.types import Array
+from magtensor.components import error_model
+from magtensor.loop.excitation import AXES, Excitation
+from magtensor.loop.terms import Terms, joined
+from magtensor.units import GRAVITY
+
+ARCMIN = np.pi / (180.0 * 60.0)
+UP = np.array([0.0, 0.0, 1.0])
+
+
+@error_model(
+    "instrument",
+    needs=("acceleration|attitude",),
+    source="METHODS A3, 26",
+    typical="1 arcmin is 14.5 nT, 29 nT/m on a baseline of 0.5 m",
+)
+def frame_flexure(x: Excitation) -> Terms:
+    """The frame bends under gravity and acceleration and turns each sensor by a small angle.
+
+    C (b x e g) with the specific force g in units of standard gravity and a matrix e of each sensor: nine
+    coefficients, the turn about one axis for a force along another. The force is that of the logged acceleration, or
+    gravity alone from the attitude where none is logged. Rivals: `fixed_source` and `site_gradient`, for gravity and
+    a source are both fixed to the ground; the sag common to all sensors is not visible without a vector reference.
+    """
+    if "acceleration" in x.logged:
+        force = x.channel("acceleration") / GRAVITY
+    elif x.attitude is not None:
+        force = into_platform(x.attitude, UP)
+    else:
+        raise KeyError("the survey has neither acceleration nor attitude")
+    bends = []
+    for about in range(3):
+        turned = x.sensed(np.cross(x.field, np.eye(3)[about] * ARCMIN))
+        for along in range(3):
+            bent = turned * force[:, None, None, along]
+            bends.append(x.one_each(bent, "arcmin/g", AXES[about] + AXES[along]))
+    return joined(bends)
+
+
+@error_model(
+    "instrument",
+    needs=("position", "gradient"),
+    source="METHODS A3, 21",
+    typical="5 nT between sensors 0.25 m apart with coils of 20 mm, 75 nT at 0.1 m",
+)
+def crosstalk(x: Excitation) -> Terms:
+    """The feedback coil of each sensor, which cancels the field there, is a dipole at the other sensors.
+
+    A coil of k cm3 adds k (3 n n - 1) b_j / r^3 at a sensor at distance r in direction n. Its part in proportion to
+    the other sensor's own field b_i is inside that sensor's C, so only b_j - b_i counts: nothing in a uniform field.
+    One coefficient for each coil.
+    """
+    if x.position is None:
+        raise KeyError("the survey has no positions")
+    coils = []
+    for j in range(len(x.sensors)):
+        stray = np.zeros_like(x.field)
+        for i in range(len(x.sensors)):
+            if i != j:
+                stray[:, i] = (x.field[:, j] - x.field[:, i]) @ _dipole(x.position[i] - x.position[j])
+        coils.append(x.sensed(1e-6 * stray))
+    number = np.arange(len(coils))
+    outputs = np.arange(3 * len(coils))
+    return Terms(
+        ("coil",) * len(coils),
+        x.sensors,
+        ("cm3",) * len(coils),
+        np.hstack([c.reshape(len(x.time), -1) for c in coils]),
+        np.repeat(number, len(outputs)),
+        np.tile(outputs, len(coils)),
+        np.arange(len(coils) * len(outputs)),
+    )
+
+
+def _dipole(r: Array) -> Array:
+    """(3, 3) 1/m3: 3 n n - 1 over the distance cubed."""
+    distance = float(np.linalg.norm(r))
+    n = r / distance
+    out: Array = (3.0 * np.outer(n, n) - np.eye(3)) / distance**3
+    return out

@@ -1,0 +1,62 @@
+"""Error models of currents and supply voltages."""
+
+from typing import Annotated
+
+from pydantic import Field
+
+from magtensor.components import error_model
+from magtensor.loop.excitation import Excitation
+from magtensor.loop.settings import AnyChannel, Choice
+from magtensor.loop.terms import Terms
+
+CURRENT = AnyChannel("current_*", or_units="A", vectors=False)
+SUPPLY = AnyChannel("supply*", or_units="V", vectors=False)
+
+Supply = Annotated[str, SUPPLY, Field(description="supply voltage channel; '': the only one")]
+
+
+@error_model(
+    "instrument",
+    needs=("current_*",),
+    source="METHODS A3, 9",
+    typical="16 nT for 1 A in a loop of 100 cm2 at 0.5 m; CryoSat-2 1 to 2 nT",
+)
+def current_field(
+    x: Excitation,
+    *,
+    channel: Annotated[str, CURRENT, Field(description="current channel; '': the only one")] = "",
+    lag_s: Annotated[
+        float,
+        Choice((0.0, 0.3, 1.0, 3.0, 10.0)),
+        Field(ge=0, description="time constant of the current behind the logged one, s"),
+    ] = 0.0,
+) -> Terms:
+    """The magnetic field of a logged current: a constant vector at each sensor, in proportion to it.
+
+    One coefficient an axis: the field as the axis senses it. Rivals: other currents that switch together;
+    `supply_offset`, for the supply sags under the current.
+    """
+    name = CURRENT.pick(x, channel)
+    return x.offsets(x.lagged(x.channel(name), lag_s), f"nT/{x.units[name]}")
+
+
+@error_model("instrument", needs=("supply*",), source="METHODS A3, 10", typical="10 ppm/V")
+def supply_scale(x: Excitation, *, channel: Supply = "") -> Terms:
+    """Each axis's scale factor follows the supply voltage.
+
+    The voltage times the axis's own output. Rivals: `supply_offset` where the attitude hardly changes;
+    `scale_drift` for a battery that discharges steadily.
+    """
+    name = SUPPLY.pick(x, channel)
+    return x.scales(1e-6 * x.channel(name), f"ppm/{x.units[name]}")
+
+
+@error_model("instrument", needs=("supply*",), source="METHODS A3, 11", typical="a nT/V")
+def supply_offset(x: Excitation, *, channel: Supply = "") -> Terms:
+    """Each axis's offset follows the supply voltage.
+
+    Rivals: `current_field` of the current under which the supply sags; `supply_scale` where the attitude hardly
+    changes; `offset_drift` for a battery that discharges steadily.
+    """
+    name = SUPPLY.pick(x, channel)
+    return x.offsets(x.channel(name), f"nT/{x.units[name]}")

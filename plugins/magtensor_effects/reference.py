@@ -1,0 +1,79 @@
+"""Error models of the reference total field: base station, its clock, its place."""
+
+from typing import Annotated
+
+import numpy as np
+from pydantic import Field
+
+from magtensor.calibration.types import Array
+from magtensor.components import error_model
+from magtensor.errors import DataError
+from magtensor.loop.excitation import Excitation
+from magtensor.loop.settings import EventTimes, Range
+from magtensor.loop.terms import Terms
+
+NEARBY_S = 2.0  # shorter delays show as the slope over this time
+
+
+def _total_field(x: Excitation) -> Array:
+    if x.total_field is None:
+        raise DataError("the survey has no reference total field")
+    return x.total_field
+
+
+@error_model(
+    "reference",
+    needs=("total_field",),
+    source="METHODS A3, 29",
+    typical="0.1 to 1 nT; some per cent of the variation over tens of km or beside a coast",
+)
+def reference_scale(x: Excitation) -> Terms:
+    """The variation at the base station is larger or smaller than at the site.
+
+    The total field about its mean; the coefficient is the excess at the base station. Common to all sensors, so the
+    tensor does not feel it. Rival: `scale_drift` where the variation is steady.
+    """
+    f = _total_field(x)
+    return x.on_reference(0.01 * (f - f.mean()), "%", "excess")
+
+
+@error_model(
+    "reference",
+    needs=("total_field",),
+    source="METHODS A3, 30",
+    typical="a leap second, a time zone, or the station's own filter; 0.1 nT for 1 s in a 10 nT pulsation of 10 min",
+)
+def reference_clock(
+    x: Excitation,
+    *,
+    lag_s: Annotated[
+        float,
+        Range(-120.0, 120.0, count=17),
+        Field(description="delay about which it is linear, s: positive where the stamps are late"),
+    ] = 0.0,
+) -> Terms:
+    """The base station's time stamps are late or early.
+
+    A reading stamped t was taken at t - d, so that F(t + d) would be right at t: the recorded F(t) minus F(t + lag_s),
+    over lag_s; the coefficient is the delay d. Beyond the ends the field is held. Shows on active days only.
+    """
+    f = _total_field(x)
+    if abs(lag_s) >= NEARBY_S:
+        return x.on_reference((f - np.interp(x.time + lag_s, x.time, f)) / lag_s, "s", "delay")
+    earlier, later = x.time - NEARBY_S / 2, x.time + NEARBY_S / 2
+    slope = (np.interp(later, x.time, f) - np.interp(earlier, x.time, f)) / NEARBY_S
+    return x.on_reference(-slope, "s", "delay")
+
+
+@error_model("reference", needs=("total_field",), source="DESIGN section 5", typical="any: the station's new place")
+def reference_step(
+    x: Excitation,
+    *,
+    time_s: Annotated[float, EventTimes(), Field(description="time of the jump, s since the survey's start")] = 0.0,
+) -> Terms:
+    """The base station was moved or retuned: its total field jumps at a time.
+
+    One coefficient. Rival: a jump of all scale factors, which nothing else would tell from it.
+    """
+    _total_field(x)
+    return x.on_reference((x.elapsed >= time_s).astype(float), "nT", "step")

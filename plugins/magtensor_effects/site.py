@@ -1,0 +1,140 @@
+"""Error models of the calibration site: real fields that are not the Earth's uniform one.
+
+World frame as in `attitude`. They are modelled while calibrating and never taken off another survey's field.
+"""
+
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from magtensor.attitude import into_platform
+from magtensor.calibration.types import Array
+from magtensor.components import error_model
+from magtensor.loop.excitation import AXES, Excitation
+from magtensor.loop.settings import Choice, EventTimes, Range
+from magtensor.loop.terms import Terms, joined
+from magtensor.tensor.elements import COMPONENTS, NINE_OF_FIVE
+from magtensor.tensor.geometry import field_polynomials, term_names
+
+
+def _world_axes(x: Excitation) -> Array:
+    """(N, 3, 3): row k is the world's axis k in the platform frame."""
+    if x.attitude is None:
+        raise KeyError("the survey has no attitude")
+    attitude = x.attitude
+    return np.stack([into_platform(attitude, axis) for axis in np.eye(3)], axis=1)
+
+
+def _places(x: Excitation, axes: Array) -> Array:
+    """(N, S, 3) m: the sensors in the world about the platform's origin."""
+    if x.position is None:
+        raise KeyError("the survey has no positions")
+    out: Array = np.einsum("nki,si->nsk", axes, x.position)
+    return out
+
+
+def _seen(x: Excitation, axes: Array, world: Array) -> Array:
+    """(N, S, 3) nT on the raw outputs of a field (N, S, 3) in the world frame."""
+    return x.sensed(np.einsum("nki,nsk->nsi", axes, world))
+
+
+@error_model(
+    "site",
+    needs=("attitude", "position"),
+    source="METHODS A3, 27 and 28",
+    typical="10 to 100 nT/m indoors; total field +-10 nT over the site of Li 2018",
+)
+def site_gradient(x: Excitation) -> Terms:
+    """The field at the site has a constant gradient: G R rho_i in the world frame, turned into the platform frame.
+
+    Five coefficients for all sensors, xx, xy, xz, yy, yz in the world frame. The platform's origin is taken to stay in
+    place. Rivals: `fixed_source`, which contains it, and `frame_flexure`.
+    """
+    axes = _world_axes(x)
+    places = _places(x, axes)
+    found = []
+    for name, element in zip(COMPONENTS, NINE_OF_FIVE.T.reshape(5, 3, 3), strict=True):
+        found.append(x.shared(_seen(x, axes, places @ element), "nT/m", name))
+    return joined(found)
+
+
+@error_model("site", needs=("attitude", "position"), source="METHODS A3, 27", typical="10 to 100 nT/m indoors")
+def fixed_source(
+    x: Excitation,
+    *,
+    degree: Annotated[
+        int, Choice((3, 4)), Field(ge=1, le=4, description="highest degree of the harmonic potential")
+    ] = 3,
+) -> Terms:
+    """A magnetic thing on the ground near the rig: its field about the rig's centre, as harmonic polynomials.
+
+    Degree 1 is a constant vector in the world, degree 2 a gradient (`site_gradient`), degree 3 and 4 the curvature
+    that a source within a few array sizes has. The coefficients, shared by all sensors, are the derivatives of the
+    field in the world frame; the constant vector is only visible against a vector reference. Rivals: `site_gradient`
+    for far sources, `frame_flexure`.
+    """
+    axes = _world_axes(x)
+    places = _places(x, axes)
+    units = ("nT", "nT/m", "nT/m2", "nT/m3")
+    found = []
+    for l in range(1, degree + 1):  # noqa: E741
+        for name in term_names(l):
+            found.append(x.shared(_seen(x, axes, _harmonic(name, places)), units[l - 1], name))
+    return joined(found)
+
+
+def _harmonic(name: str, places: Array) -> Array:
+    """(N, S, 3) field of a harmonic term at places (N, S, 3) m."""
+    out = np.zeros_like(places)
+    for i, polynomial in enumerate(field_polynomials(name)):
+        for powers, value in polynomial.items():
+            exponents: NDArray[np.int_] = np.array(powers)
+            out[..., i] += value * np.prod(places**exponents, axis=-1)
+    return out
+
+
+@error_model(
+    "site",
+    needs=("attitude", "position"),
+    source="METHODS A3, 27; dipole on a straight track (Anderson functions)",
+    typical="a car of 200 A m2: 20 nT at 10 m for some seconds",
+)
+def passing_source(
+    x: Excitation,
+    *,
+    time_s: Annotated[
+        float, EventTimes(120), Field(description="when it is nearest, s since the survey's start")
+    ] = 0.0,
+    passage_s: Annotated[
+        float,
+        Range(0.5, 60.0, count=5, spacing="log"),
+        Field(gt=0, description="smallest distance over speed, s"),
+    ] = 5.0,
+    gradient: Annotated[
+        bool, Choice((False, True)), Field(description="true: its field differs between the sensors")
+    ] = False,
+) -> Terms:
+    """A dipole that passes on a straight track, such as a vehicle.
+
+    With u = (t - time_s) / passage_s its field is a combination of 1, u, u^2 over (1 + u^2)^(5/2) for every component
+    in the world, whatever the moment, the track and the distance; its gradient one of 1, u, u^2, u^3 over
+    (1 + u^2)^(7/2). Nine coefficients for all sensors, and twenty more with `gradient`.
+    """
+    axes = _world_axes(x)
+    u = (x.elapsed - time_s) / passage_s
+    found = []
+    for k in range(3):
+        shape = u**k / (1 + u**2) ** 2.5
+        for i, axis in enumerate(AXES):
+            world = shape[:, None, None] * np.broadcast_to(np.eye(3)[i], x.output.shape)
+            found.append(x.shared(_seen(x, axes, world), "nT", f"{axis}{k}"))
+    if gradient:
+        places = _places(x, axes)
+        for name, element in zip(COMPONENTS, NINE_OF_FIVE.T.reshape(5, 3, 3), strict=True):
+            pattern = _seen(x, axes, places @ element)
+            for k in range(4):
+                shape = u**k / (1 + u**2) ** 3.5
+                found.append(x.shared(shape[:, None, None] * pattern, "nT/m", f"{name}{k}"))
+    return joined(found)

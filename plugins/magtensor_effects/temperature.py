@@ -1,0 +1,81 @@
+"""Error models of temperature."""
+
+from typing import Annotated
+
+from pydantic import Field
+
+from magtensor.components import error_model
+from magtensor.loop.excitation import Excitation
+from magtensor.loop.settings import AnyChannel, Range
+from magtensor.loop.terms import Terms
+
+THERMOMETER = AnyChannel("temperature*", or_units="degC", vectors=False)
+
+Thermometer = Annotated[
+    str, THERMOMETER, Field(description="temperature channel, one for all sensors or one for each; '': the only one")
+]
+ThermalLag = Annotated[
+    float,
+    Range(0.0, 600.0, count=8, spacing="log"),
+    Field(ge=0, description="time constant of the sensor behind the thermometer, s"),
+]
+
+
+@error_model(
+    "instrument",
+    needs=("temperature*",),
+    source="METHODS A3, 1 and 4",
+    typical="0.1 nT/degC for a good fluxgate; thermal lags of minutes",
+)
+def temperature_offset(x: Excitation, *, channel: Thermometer = "", lag_s: ThermalLag = 0.0) -> Terms:
+    """Each axis's offset follows the temperature of the sensor, which lags the thermometer.
+
+    The thermometer is seen through a first-order lag, also across gaps in the recording. One coefficient an axis.
+    Rivals: `offset_drift` and `warm_up` where the temperature rises steadily; `temperature_scale` where the attitude
+    hardly changes; `temperature_rate` for short lags.
+    """
+    name = THERMOMETER.pick(x, channel)
+    return x.offsets(x.lagged(x.channel(name), lag_s), f"nT/{x.units[name]}")
+
+
+@error_model(
+    "instrument",
+    needs=("temperature*",),
+    source="METHODS A3, 2",
+    typical="20 ppm/degC for a fluxgate, 100 for an orthogonal one, below 1 for Swarm after correction",
+)
+def temperature_scale(x: Excitation, *, channel: Thermometer = "", lag_s: ThermalLag = 0.0) -> Terms:
+    """Each axis's scale factor follows the temperature of the sensor, which lags the thermometer.
+
+    The lagged temperature times the axis's own output. One coefficient an axis. Rivals: `temperature_offset` where
+    the attitude hardly changes; `scale_drift` where the temperature rises steadily.
+    """
+    name = THERMOMETER.pick(x, channel)
+    return x.scales(1e-6 * x.lagged(x.channel(name), lag_s), f"ppm/{x.units[name]}")
+
+
+@error_model(
+    "instrument",
+    needs=("temperature*",),
+    source="METHODS A3, 3",
+    typical="a nT where sun and shade alternate (Swarm: 1.05 nT rms with it, 0.55 without)",
+)
+def temperature_rate(
+    x: Excitation,
+    *,
+    channel: Thermometer = "",
+    tau_s: Annotated[
+        float,
+        Range(5.0, 600.0, count=6, spacing="log"),
+        Field(gt=0, description="time constant of the core behind the skin, s"),
+    ] = 20.0,
+) -> Terms:
+    """Thermoelectric currents follow the temperature difference between the skin of a body and its core.
+
+    The core follows the logged temperature with a first-order lag; for changes slower than that the difference is
+    tau_s times the rate of change, without the noise that a numerical derivative would bring. One coefficient an
+    axis. Rival: `temperature_offset` with a lag.
+    """
+    name = THERMOMETER.pick(x, channel)
+    skin = x.channel(name)
+    return x.offsets(skin - x.lagged(skin, tau_s), f"nT/{x.units[name]}")
