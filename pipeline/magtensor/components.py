@@ -133,9 +133,32 @@ class Component:
             for name, p in self.parameters.items()
             if name not in components
         }
-        return create_model(
-            self.name, __config__=ConfigDict(extra="forbid", strict=True, arbitrary_types_allowed=True), **fields
-        )
+        config = ConfigDict(extra="forbid", strict=True, validate_default=True)
+        return create_model(self.name, __config__=config, **fields)
+
+    def check(self) -> None:
+        """See that the options can be options.
+
+        Raises:
+            PluginError: an option has no type, one that no value of a recipe can have, or a default of another type.
+        """
+        from pydantic import PydanticUserError, TypeAdapter, ValidationError
+
+        try:
+            self.options.model_validate({})
+        except PydanticUserError as error:
+            for name, p in self.parameters.items():
+                try:
+                    TypeAdapter(p.annotation)
+                except PydanticUserError:
+                    what = f"option {name} has a type that no recipe can give"
+                    raise PluginError(f"{self.kind} {self.name}: {what}") from None
+            raise PluginError(f"{self.kind} {self.name}: {error}") from error
+        except ValidationError as error:
+            for one in error.errors(include_url=False):
+                if one["type"] != "missing":
+                    what = f"default of option {one['loc'][0]}: {one['msg']}"
+                    raise PluginError(f"{self.kind} {self.name}: {what}") from error
 
 
 def _mark(kind: str, name: str | None, **facts: Any) -> Callable[[F], F]:
@@ -206,5 +229,11 @@ def error_model(
 
 def component_of(candidate: object) -> Component | None:
     """The component a marked function carries, else None."""
-    found = getattr(candidate, MARK, None) if callable(candidate) else None
+    found = own_attribute(candidate, MARK)
     return found if isinstance(found, Component) else None
+
+
+def own_attribute(thing: object, name: str) -> Any:
+    """An attribute that was set on the thing itself; never one that it makes up when asked, as mocks do."""
+    own = getattr(thing, "__dict__", None)
+    return own.get(name) if isinstance(own, dict) else None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from typing import Any
 
 from magtensor.components import Component
@@ -25,7 +26,7 @@ def _described(registry: Registry, component: Component) -> dict[str, Any]:
         "name": component.name,
         "summary": component.summary,
         "plugin": registry.origin[(component.kind, component.step, component.name)].origin,
-        "options": component.options.model_json_schema(),
+        "options": _finite(component.options.model_json_schema()),
     }
     if component.kind == "method":
         facts |= {"stage": component.step, "source": component.source}
@@ -46,6 +47,15 @@ def _described(registry: Registry, component: Component) -> dict[str, Any]:
     return facts
 
 
+def _finite(value: Any) -> Any:
+    """JSON has no infinity: such a default becomes text."""
+    if isinstance(value, dict):
+        return {k: _finite(v) for k, v in value.items()}
+    if isinstance(value, list):
+        return [_finite(v) for v in value]
+    return str(value) if isinstance(value, float) and not math.isfinite(value) else value
+
+
 def _label(component: Component) -> str:
     return f"{component.step}: {component.name}" if component.step else component.name
 
@@ -63,7 +73,7 @@ def show_plugins(registry: Registry) -> None:
     for plugin in registry.plugins:
         origin = str(plugin.file) if plugin.file else plugin.distribution
         version = plugin.sha256[:12] if plugin.file else plugin.version
-        table.add_row(plugin.name, origin, version, _state(registry, plugin))
+        table.add_row(*(escape(cell) for cell in (plugin.name, origin, version, _state(registry, plugin))))
     console.print(table)
     components = Table(title="what they give", title_justify="left")
     for column in ("kind", "name", "what it does"):
@@ -97,7 +107,7 @@ def show_one(registry: Registry, name: str) -> None:
         console.print(escape((component.function.__doc__ or "").strip()))
         if component.source:
             console.print(f"source: {escape(component.source)}")
-        console.print(f"from {registry.origin[(kind, step, name)].origin}")
+        console.print(escape(f"from {registry.origin[(kind, step, name)].origin}"))
         if kind == "stage" and not callable(component.declares):
             for word in ("needs", "uses", "gives", "may_give"):
                 if paths := getattr(component.declares, word):

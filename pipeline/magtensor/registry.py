@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import importlib.metadata
 import importlib.util
@@ -15,7 +16,7 @@ from typing import Any
 import pluggy
 
 from magtensor import hookspecs
-from magtensor.components import KINDS, Component, PluginError, component_of
+from magtensor.components import KINDS, Component, PluginError, component_of, own_attribute
 from magtensor.errors import UsageError, did_you_mean
 
 ENTRY_POINTS = "magtensor"
@@ -97,20 +98,28 @@ class Registry:
 
     def _add(self, plugin: Plugin, load: Any) -> None:
         try:
-            module = load()
-            found = list(_components(module, plugin))
-            for component in found:
-                _ = component.options  # a bad signature is the plugin's fault, told here
+            with contextlib.redirect_stdout(sys.stderr):  # standard output is for answers, not for plugins
+                found = list(_components(load(), plugin))
         except PluginError as error:
             self.problems.append(f"{plugin.origin}: {error}")
             self.plugins.append(_broken(plugin, str(error)))
             return
-        except (Exception, SystemExit) as error:
+        except KeyboardInterrupt:
+            raise
+        except BaseException as error:  # also SystemExit: a plugin must not end the program
             self.plugins.append(_broken(plugin, f"{type(error).__name__}: {error}"))
+            return
+        try:
+            for component in found:
+                component.check()
+        except PluginError as error:
+            self.plugins.append(_broken(plugin, str(error)))
             return
         self.plugins.append(plugin)
         for component in found:
             key = (component.kind, component.step, component.name)
+            if self.components.get(key) is component:  # a package that shows one function in two places
+                continue
             if key in self.components:
                 what = f"{component.kind} {component.name}" + (f" of {component.step}" if component.step else "")
                 self.problems.append(f"{what} is given twice: by {self.origin[key].origin} and by {plugin.origin}")
@@ -167,6 +176,8 @@ def _broken(plugin: Plugin, error: str) -> Plugin:
 
 def _single_files(folder: Path) -> list[Path]:
     if folder.is_file():
+        if folder.suffix != ".py":
+            raise UsageError(f"plugin file {folder} is no Python file")
         return [folder]
     if not folder.is_dir():
         raise UsageError(f"plugin folder {folder} does not exist")
@@ -194,7 +205,7 @@ def _components(module: ModuleType, plugin: Plugin) -> Iterator[Component]:
     manager.add_hookspecs(hookspecs)
     specs = {n for n in vars(hookspecs) if n.startswith(f"{hookspecs.PROJECT}_")}
     for name, value in vars(module).items():
-        marked = getattr(value, f"{hookspecs.PROJECT}_impl", None) is not None
+        marked = isinstance(own_attribute(value, f"{hookspecs.PROJECT}_impl"), dict)
         hook_like = name.startswith(f"{hookspecs.PROJECT}_") and callable(value) and component_of(value) is None
         if (marked or hook_like) and name not in specs:
             raise PluginError(f"{name} is no hook of magtensor{did_you_mean(name, specs)}")
@@ -203,10 +214,9 @@ def _components(module: ModuleType, plugin: Plugin) -> Iterator[Component]:
     manager.register(module, name=plugin.name)
     given: dict[int, Component] = {}
     for value in vars(module).values():
-        # only its own: a plugin may import another's function to build upon it
-        home = str(getattr(value, "__module__", ""))
-        own = home == module.__name__ or home.startswith(f"{module.__name__}.")
-        if own and (component := component_of(value)) is not None:
+        component = component_of(value)
+        # only its package's own: a plugin may import another's function to build upon it
+        if component is not None and _package(component.function.__module__) == _package(module.__name__):
             given[id(component)] = component
     for batch in manager.hook.magtensor_components():
         for value in batch:
@@ -217,3 +227,7 @@ def _components(module: ModuleType, plugin: Plugin) -> Iterator[Component]:
                 )
             given[id(component)] = component
     yield from given.values()
+
+
+def _package(module: str) -> str:
+    return module.split(".", 1)[0]

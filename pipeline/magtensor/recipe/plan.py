@@ -291,7 +291,7 @@ class _Planner:
         resolved = [
             str((self.document.folder / n).resolve()) if (self.document.folder / n).exists() else n for n in names
         ]
-        return tuple(resolved) + tuple(str(Path(f).resolve()) for f in self.plugin_folders)
+        return tuple(dict.fromkeys([*resolved, *(str(Path(f).resolve()) for f in self.plugin_folders)]))
 
     def require(self, at: Location, wanted: Path | str) -> None:
         if isinstance(wanted, Path):
