@@ -11,7 +11,7 @@ from magtensor import provenance, result
 from magtensor.errors import DataError
 from magtensor.provenance import Provenance
 from magtensor.recipe.plan import Plan, plan, read_plan
-from magtensor.recipe.source import parse_yaml
+from magtensor.recipe.source import Document
 from magtensor.runner import run
 from magtensor.survey.model import Survey
 from magtensor.verdict import sentence, survey_block, verdict
@@ -108,18 +108,16 @@ def again(
     survey: Path | None = None,
 ) -> Plan:
     """The plan of a result, from its provenance."""
-    import json
-
     folder = Path(before.notes.get("folder", "."))
-    document = parse_yaml(json.dumps(before.recipe), f"{path}:/provenance", folder)
+    document = Document(before.recipe, f"{path}:/provenance", {}, folder)
     return plan(document, overrides=overrides, plugin_folders=plugin_folders, survey=survey)
 
 
 def compare(before: Provenance, now: Provenance) -> tuple[str, ...]:
     """In words: whether a re-run gave the same bits, and what was different where not."""
-    if before.content_sha256 == now.content_sha256:
-        return ("reproduced bit for bit",)
     changes = provenance.differences(before, now)
+    if before.content_sha256 == now.content_sha256:
+        return ("reproduced bit for bit", *changes)
     return ("NOT the same bits as the result it was run from", *(changes or ["no version differs"]))
 
 
@@ -140,18 +138,23 @@ def verification(calibrated: Survey, path: Path, planned: Plan) -> dict[str, Any
 def apply_to(calibration: Survey, path: Path, planned: Plan, *, tolerant: bool = False) -> Survey:
     """Another survey, loaded as the recipe loads and corrected with a calibration; `tolerant` as in `load_as`."""
     from magtensor.calibrated import corrected, require_sensors, restored
-    from magtensor.tensors import assembled, stored_assembly, stored_refinement
+    from magtensor.tensor.elements import five
+    from magtensor.tensors import assembled, refined, refinement_noise, stored_assembly, stored_refinement
 
     survey = load_as(planned, path, tolerant=tolerant)
-    require_sensors(survey, result.sensors_of(calibration), str(path))
-    fitted = restored(calibration)
-    survey = survey.merged(corrected(fitted, survey))
-    if "calibration/tensor_gain" in calibration:
-        b, noise = survey.values("calibrated/b"), calibration.values("calibration/noise_std")
-        position = calibration.values("calibration/position")
-        survey = survey.merged(
-            assembled(stored_assembly(calibration), b, position, noise, fitted, stored_refinement(calibration))
-        )
+    refinement = stored_refinement(calibration)
+    if "calibration/matrix" in calibration:
+        require_sensors(survey, result.sensors_of(calibration), str(path))
+        fitted = restored(calibration)
+        survey = survey.merged(corrected(fitted, survey))
+        if "calibration/tensor_gain" in calibration:
+            b, noise = survey.values("calibrated/b"), calibration.values("calibration/noise_std")
+            position = calibration.values("calibration/position")
+            assembly = stored_assembly(calibration)
+            survey = survey.merged(assembled(assembly, b, position, noise, fitted, refinement))
+    elif refinement is not None:
+        measured = five(survey.values("calibrated/tensor"))
+        survey = survey.merged(refined(measured, refinement_noise(calibration), refinement))
     return survey
 
 

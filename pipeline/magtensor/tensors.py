@@ -133,6 +133,11 @@ def refinement_variables(matrix: Array, offset: Array, covariance: Array, facts:
     }
 
 
+def refinement_noise(calibration: Survey) -> float:
+    """nT/m, of one component of the tensors that were refined, as the refinement found it."""
+    return float(calibration["calibration/tensor_matrix"].attrs["noise_std"])
+
+
 def stored_refinement(calibration: Survey) -> tuple[Array, Array, Array] | None:
     """What `refinement_variables` stored, if there is one."""
     if "calibration/tensor_matrix" not in calibration:
@@ -154,22 +159,48 @@ def closure_variables(b: Array, position: Array) -> dict[str, Variable]:
     }
 
 
-def tensor_variables(tensor: Array, std: Array) -> dict[str, Variable]:
-    """`calibrated/tensor` and `tensor_std`."""
-    return {
+def refined(measured: Array, noise: float, refinement: tuple[Array, Array, Array]) -> dict[str, Variable]:
+    """The refined tensor of an instrument that measures gradients itself, its invariants, and their deviations.
+
+    Args:
+        measured: (N, 5) nT/m.
+        noise: nT/m, of one measured component; NaN where unknown, and the deviations then hold the refinement's part.
+        refinement: H (5, 5), D (5,) nT/m and their covariance (30, 30).
+    """
+    matrix, offset, covariance = refinement
+    tensor = full(measured @ matrix.T + offset)
+    values = np.stack(invariants(tensor), axis=1)
+    own = noise**2 * matrix @ matrix.T if np.isfinite(noise) else np.zeros((5, 5))
+    std, deviations = np.empty_like(tensor), np.empty_like(values)
+    for start in range(0, len(measured), _CHUNK):
+        part = slice(start, start + _CHUNK)
+        each = own + _refinement_covariance(measured[part], covariance)
+        std[part] = np.sqrt(np.einsum("ka,nab,kb->nk", NINE_OF_FIVE, each, NINE_OF_FIVE)).reshape(-1, 3, 3)
+        deviations[part] = np.stack(invariants_std(tensor[part], each), axis=1)
+    return tensor_variables(tensor, std) | invariant_variables(values, deviations)
+
+
+def tensor_variables(tensor: Array, std: Array | None = None) -> dict[str, Variable]:
+    """`calibrated/tensor` and, where it is known, `tensor_std`."""
+    given: dict[str, Variable] = {
         "calibrated/row": (("row",), np.array(AXES), {}),
         "calibrated/column": (("column",), np.array(AXES), {}),
         "calibrated/tensor": (TENSOR, tensor, {"units": "nT/m", "long_name": "gradient tensor, dB_row/dx_column"}),
-        "calibrated/tensor_std": (TENSOR, std, {"units": "nT/m", "long_name": "noise and calibration"}),
     }
+    if std is not None:
+        attributes = {"units": "nT/m", "long_name": "noise and calibration"}
+        given["calibrated/tensor_std"] = (TENSOR, std, attributes)
+    return given
 
 
-def invariant_variables(values: Array, deviations: Array) -> dict[str, Any]:
-    """`calibrated/invariants` and `invariants_std`."""
+def invariant_variables(values: Array, deviations: Array | None = None) -> dict[str, Any]:
+    """`calibrated/invariants` and, where they are known, `invariants_std`."""
     names = np.array(Invariants._fields)
     units = json.dumps(dict(zip(Invariants._fields, INVARIANT_UNITS, strict=True)))
-    return {
+    given: dict[str, Any] = {
         "calibrated/invariant": (("invariant",), names, {"units_of_each": units}),
         "calibrated/invariants": (("time", "invariant"), values, {"units": "see invariant"}),
-        "calibrated/invariants_std": (("time", "invariant"), deviations, {"units": "see invariant"}),
     }
+    if deviations is not None:
+        given["calibrated/invariants_std"] = (("time", "invariant"), deviations, {"units": "see invariant"})
+    return given

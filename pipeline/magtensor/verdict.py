@@ -20,7 +20,7 @@ def verdict(survey: Survey, verify: dict[str, Any] | None = None) -> dict[str, A
     block = survey_block(survey)
     found: dict[str, Any] = {
         "schema": SCHEMA,
-        "declared": ["linear"] if "calibration/matrix" in survey else [],
+        "declared": ["linear"] if {"calibration/matrix", "calibration/tensor_matrix"} & set(survey) else [],
         "noise_floor_nT": noise_floor(survey),
         "adopted": [],
         "rejected": [],
@@ -66,8 +66,10 @@ def sentence(outcome: dict[str, Any]) -> str:
     """The verdict in one sentence."""
     parts = []
     block = outcome["error"].get("verify", {}).get("after") or outcome["error"].get("fit")
-    if not block:
+    if not block and not outcome["declared"]:
         return "Nothing was calibrated."
+    if not block:
+        return "The tensor was refined; its error cannot be told without a tensor that is known."
     where = "on the verification survey" if "verify" in outcome["error"] else "on the survey it was fitted to"
     if block["total_field_rms_nT"]:
         parts.append(f"total field {_figure(block['total_field_rms_nT']['all'])} nT rms")

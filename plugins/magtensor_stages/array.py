@@ -11,7 +11,7 @@ from magtensor import DataError, MethodChoice, stage
 from magtensor.calibrated import restored
 from magtensor.calibration.types import PARAMETERS_PER_SENSOR, SensorCalibration
 from magtensor.errors import did_you_mean
-from magtensor_stages.sensors import common_frame
+from magtensor_stages.sensors import common_frame, naming
 
 if TYPE_CHECKING:
     from magtensor.survey.model import Survey
@@ -59,12 +59,9 @@ def align(
     if "total_field" in survey:
         good &= np.isfinite(survey.values("total_field"))
     reference = sensors.index(to) if to is not None else 0
-    aligned = method(b[good], calibrations, reference)
-    frame = aligned.frame.replace(f"sensor {reference + 1}", f"sensor {sensors[reference]}")
-    named = type(aligned)(
-        aligned.matrix, aligned.offset, aligned.covariance, frame, aligned.unobservable, aligned.diagnostics
-    )
-    return common_frame(survey, named, method.__name__)
+    with naming(sensors):
+        aligned = method(b[good], calibrations, reference)
+    return common_frame(survey, aligned, method.__name__)
 
 
 @stage(
@@ -98,5 +95,6 @@ def assemble_tensor(survey: Survey, *, method: MethodChoice = "least_squares") -
     total_field = survey.values("total_field") if "total_field" in survey else None
     noise = noise_std(b[good], None if total_field is None else total_field[good])
     known = bool(np.isfinite(noise).all() and (noise > 0).all())
-    assembly = method(position, np.diag(noise.ravel() ** 2) if known else None)
+    with naming(survey.sensors):
+        assembly = method(position, np.diag(noise.ravel() ** 2) if known else None)
     return assembly_variables(assembly, position, noise) | assembled(assembly, b, position, noise, restored(survey))

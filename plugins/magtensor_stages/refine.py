@@ -16,11 +16,11 @@ if TYPE_CHECKING:
 
 
 @stage(
-    needs=(
-        "calibrated/b", "calibrated/tensor", "calibration/matrix", "calibration/offset", "calibration/covariance",
+    needs=("calibrated/tensor",),
+    uses=(
+        "segment", "calibrated/b", "calibration/matrix", "calibration/offset", "calibration/covariance",
         "calibration/tensor_gain", "calibration/field_gain", "calibration/noise_std", "calibration/position",
     ),
-    uses=("segment",),
     gives=(
         "calibrated/tensor", "calibrated/tensor_std", "calibrated/invariants", "calibrated/invariants_std",
         "calibration/tensor_matrix", "calibration/tensor_offset", "calibration/tensor_covariance",
@@ -42,10 +42,12 @@ def refine_invariants(
 ) -> dict[str, Any]:
     """Refine the tensor so that its invariants stay what they are while the array rotates in one place near a source.
 
-    A method is ``f(tensor (N, 3, 3) nT/m, invariant_1, invariant_2, *, options) -> TensorCalibration``. It leaves a
-    common rotation of the tensor's frame open, which no invariant shows.
+    The tensor is that of an array of sensors (`assemble_tensor`) or one measured as such (`load_tensor`). A method is
+    ``f(tensor (N, 3, 3) nT/m, invariant_1, invariant_2, *, options) -> TensorCalibration``. It leaves a common rotation
+    of the tensor's frame open, which no invariant shows.
     """
-    from magtensor.tensors import assembled, refinement_variables, stored_assembly
+    from magtensor.tensor.elements import five
+    from magtensor.tensors import assembled, refined, refinement_variables, stored_assembly
 
     tensor = survey.values("calibrated/tensor")
     use = survey.good & np.isfinite(tensor).all(axis=(1, 2))
@@ -63,19 +65,20 @@ def refine_invariants(
     if not use.any():
         raise NotEnoughData("refine_invariants: no sample is left in use")
     refinement = method(tensor[use], invariant_1, invariant_2)
-    b, noise = survey.values("calibrated/b"), survey.values("calibration/noise_std")
-    position = survey.values("calibration/position")
     facts = {
         "method": method.__name__,
         "rank": refinement.rank,
         "nullity": refinement.nullity,
         "triaxiality": refinement.triaxiality,
         "gauge_angle_rad": refinement.gauge_angle,
+        "noise_std": refinement.noise_std,
         "verdict": json.dumps(list(refinement.verdict)),
         "diagnostics": json.dumps(dict(refinement.diagnostics), default=float),
     }
     stored = refinement_variables(refinement.matrix, refinement.offset, refinement.covariance, facts)
-    return stored | assembled(
-        stored_assembly(survey), b, position, noise, restored(survey),
-        (refinement.matrix, refinement.offset, refinement.covariance),
-    )  # fmt: skip
+    coefficients = refinement.matrix, refinement.offset, refinement.covariance
+    if "calibration/tensor_gain" not in survey:
+        return stored | refined(five(tensor), refinement.noise_std, coefficients)
+    b, noise = survey.values("calibrated/b"), survey.values("calibration/noise_std")
+    position = survey.values("calibration/position")
+    return stored | assembled(stored_assembly(survey), b, position, noise, restored(survey), coefficients)

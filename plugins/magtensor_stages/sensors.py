@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -41,6 +42,27 @@ def each_sensor(survey: Survey, fit: Callable[[int, np.ndarray], SensorCalibrati
             place = " ".join(p for p in (source, f"sensor {name}", error.where) if p)
             raise type(error)(error.what, where=place, hint=error.hint) from error
     return calibrations
+
+
+def by_name(text: str, sensors: list[str]) -> str:
+    """A method's words with the sensors' names for its numbers: `sensors 2, 3` to `sensors S2, S3`."""
+    import re
+
+    def named(found: re.Match[str]) -> str:
+        return re.sub(r"\d+", lambda n: sensors[int(n[0]) - 1] if 0 < int(n[0]) <= len(sensors) else n[0], found[0])
+
+    # "sensors 1 to 4" speaks of a layout, not of these sensors; "contrast_rms_3_nT" is a diagnostic's key
+    return re.sub(r"\bsensors? \d+\b(?! to )((, | and )\d+\b)*|(?<=_)\d+(?=_nT$)", named, text)
+
+
+@contextmanager
+def naming(sensors: list[str]) -> Iterator[None]:
+    """Methods count the sensors from 1; what they refuse, the user reads with the sensors' names."""
+    try:
+        yield
+    except DataError as error:
+        what, where, hint = (by_name(text, sensors) for text in (error.what, error.where, error.hint))
+        raise type(error)(what, where=where, hint=hint) from error
 
 
 def side_by_side(calibrations: list[SensorCalibration]) -> ArrayCalibration:
@@ -98,7 +120,8 @@ def calibrate_array(survey: Survey, *, method: MethodChoice = "joint") -> dict[s
     good = survey.good & np.isfinite(total_field) & np.isfinite(raw).all(axis=(1, 2))
     if not good.any():
         raise NotEnoughData("no sample has all sensors in use and a total field")
-    calibration = method(raw[good], total_field[good])
+    with naming(survey.sensors):
+        calibration = method(raw[good], total_field[good])
     given = common_frame(survey, calibration, method.__name__)
     if calibration.kept is not None and not calibration.kept.all():
         doubted = np.zeros(len(good), dtype=bool)
@@ -139,6 +162,13 @@ def common_frame(survey: Survey, calibration: ArrayCalibration, method: str) -> 
     """The variables of a calibration whose sensors share one frame."""
     from magtensor.calibration.factors import rotation_and_upper
 
+    names = survey.sensors
+    calibration = replace(
+        calibration,
+        frame=by_name(calibration.frame, names),
+        unobservable=tuple(by_name(words, names) for words in calibration.unobservable),
+        diagnostics={by_name(key, names): value for key, value in calibration.diagnostics.items()},
+    )
     given = stored(calibration, survey.sensors, method=method) | corrected(calibration, survey)
     rotation = np.stack([rotation_and_upper(m)[0] for m in calibration.matrix])
     attributes = {"units": "1", "frame": calibration.frame, "long_name": "sensor (z along its z axis) to common frame"}

@@ -14,6 +14,7 @@ from pydantic import Field
 
 from magtensor.errors import UsageError
 from magtensor.simulate.geometry import ArraySpec, names, positions
+from magtensor.simulate.gradiometers import Gradiometers, GradiometersSpec, build_gradiometers
 from magtensor.simulate.noise import NoiseSpec
 from magtensor.simulate.rotations import passive
 from magtensor.simulate.spec import Array, Matrix3, Spec, Vector3, stream
@@ -146,6 +147,9 @@ class InstrumentSpec(Spec):
         description="bounds of random errors, or the errors of each sensor; an empty list: perfect sensors",
     )
     noise: NoiseSpec = Field(default=NoiseSpec(), description="noise of the vector sensors")
+    gradiometers: GradiometersSpec | None = Field(
+        None, description="elemental gradiometers, logged as channels gradient_xx, ... gradient_yz; none where null"
+    )
     resolution_nT: float = Field(0.0, ge=0, description="step of the digitiser, nT; 0: none")
     range_nT: float | None = Field(None, gt=0, description="output saturates at +- this, nT")
 
@@ -156,12 +160,14 @@ class Instrument:
 
     Attributes:
         names: S names; positions: (S, 3) m; matrix: C (S, 3, 3); offset: o (S, 3) nT.
+        gradiometers: None where there are none.
     """
 
     names: list[str]
     positions: Array
     matrix: Array
     offset: Array
+    gradiometers: Gradiometers | None = None
 
 
 def build_instrument(spec: InstrumentSpec) -> Instrument:
@@ -185,4 +191,5 @@ def build_instrument(spec: InstrumentSpec) -> Instrument:
         positions(spec.array),
         np.array([c for c, _ in linear]),
         np.array([o for _, o in linear]),
+        None if spec.gradiometers is None else build_gradiometers(spec.gradiometers, stream(spec.seed, "gradiometers")),
     )

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from magtensor.simulate.gradiometers import COMPONENTS
 from magtensor.simulate.run import Simulated, Truth
 
 if TYPE_CHECKING:
@@ -154,6 +155,12 @@ def _write_truth(file: h5py.File, simulated: Simulated) -> None:
         "1",
         "attitude, platform to world",
     )
+    if truth.gradiometers is not None:
+        for name in ("component", "true_component"):
+            _scale(group, name, list(COMPONENTS), long_name="of the tensor")
+        both = ("component", "true_component")
+        _variable(group, "gradiometer_matrix", truth.gradiometers.matrix, both, "1", "K of T = K G + O")
+        _variable(group, "gradiometer_offset", truth.gradiometers.offset, both[:1], "nT m-1", "O of T = K G + O")
     for i, effect in enumerate(truth.effects):
         if effect.added.size:
             name = f"effect_{i:02d}_{effect.name}"

@@ -20,6 +20,7 @@ from magtensor.simulate.effects.base import CHUNK, Bench, EffectTruth, SensorEff
 from magtensor.simulate.effects.reference import ReferenceEffectSpec
 from magtensor.simulate.effects.site import SiteEffectSpec, site_effect
 from magtensor.simulate.field import FieldModel, Variation
+from magtensor.simulate.gradiometers import Gradiometers
 from magtensor.simulate.instrument import Instrument, InstrumentSpec, build_instrument
 from magtensor.simulate.motion import (
     NOT_RECORDED,
@@ -50,6 +51,7 @@ class Truth:
         matrix: C (S, 3, 3); offset: o (S, 3) nT: the linear part of each sensor, m = C b + o.
         noise_sd: (S, 3) nT, white part, before any averaging.
         attitude: (N, 4) platform to world, scalar last.
+        gradiometers: the errors of the elemental gradiometers, where there are any.
         effects: what was added on top.
     """
 
@@ -61,6 +63,7 @@ class Truth:
     offset: Array
     noise_sd: Array
     attitude: Array
+    gradiometers: Gradiometers | None
     effects: list[EffectTruth]
 
 
@@ -248,7 +251,16 @@ def _logged(scenario: Scenario, bench: Bench, rows: _Rows) -> dict[str, tuple[Ar
         if spec.logged:
             dims = ("time",) if channel.values.ndim == 1 else ("time", "sensor")
             out[name] = (rows.taken(logged(name, spec, channel, scenario.seed)), dims, channel.units)
+    if bench.instrument.gradiometers is not None:
+        readings = bench.instrument.gradiometers.readings(_tensor(bench), stream(scenario.seed, "gradiometers"))
+        out |= {name: (rows.taken(values), ("time",), "nT m-1") for name, values in readings.items()}
     return out | _inertial(scenario.logging, bench.field.motion, bench, rows)
+
+
+def _tensor(bench: Bench) -> Array:
+    """(n, 3, 3) nT/m at the array's centre, on the even time base."""
+    centre = bench.instrument.positions.mean(axis=0)
+    return bench.over_time(lambda t: bench.field.tensor(t, centre))
 
 
 def _inertial(
@@ -276,7 +288,7 @@ def _inertial(
 def _truth(scenario: Scenario, bench: Bench, rows: _Rows, effects: list[tuple[EffectTruth, Array]]) -> Truth:
     instrument: Instrument = bench.instrument
     centre = instrument.positions.mean(axis=0)
-    tensor = bench.over_time(lambda t: bench.field.tensor(t, centre))
+    tensor = _tensor(bench)
     total = bench.over_time(lambda t: np.linalg.norm(bench.field.at(t, centre[None])[:, 0], axis=-1))
     kinds = {True: rows.taken, False: lambda values: values}
     return Truth(
@@ -288,5 +300,6 @@ def _truth(scenario: Scenario, bench: Bench, rows: _Rows, effects: list[tuple[Ef
         offset=instrument.offset,
         noise_sd=level(scenario.instrument.noise.white_sd_nT, len(instrument.names), "white_sd_nT"),
         attitude=rows.first(bench.over_time(bench.field.motion.attitude)),
+        gradiometers=instrument.gradiometers,
         effects=[replace(t, added=kinds[t.kind != "reference"](a) if a.size else a) for t, a in effects],
     )
