@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time as clock
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from fnmatch import fnmatchcase
@@ -58,7 +58,9 @@ class Watched(Survey):
             raise UsageError(f"stage {self.stage} reads {path}, which it declares neither in needs nor in uses")
         found = super().__getitem__(path)
         self.was_read.add(path)
-        return found
+        values = found.values.view()
+        values.flags.writeable = False  # a stage that writes in place would change what others read, unrecorded
+        return found.copy(data=values)
 
     def __contains__(self, path: object) -> bool:
         return self.allowed(str(path)) and super().__contains__(path)
@@ -110,6 +112,8 @@ def run_stage(stage: PlannedStage, survey: Survey) -> tuple[Survey, StageRecord]
         after, wrote = _merge(stage, survey, given)
     except MagtensorError:
         raise
+    except SystemExit as error:
+        raise RuntimeError(f"stage {stage.name} tried to end the program ({error!r})") from error
     except Exception as error:
         error.add_note(f"in stage {stage.name}, options {dict(stage.described)}")
         raise
@@ -139,6 +143,7 @@ def _require(stage: PlannedStage, survey: Survey) -> None:
 
 def _merge(stage: PlannedStage, survey: Survey, given: Any) -> tuple[Survey, list[str]]:
     if isinstance(given, Survey):  # a loader makes the survey
+        _require_promised(stage, given.paths())
         return given, [p for p in given.paths() if p not in survey.paths()]
     if not isinstance(given, Mapping):
         raise UsageError(f"stage {stage.name} returned {type(given).__name__}, not a mapping of paths to variables")
@@ -148,7 +153,12 @@ def _merge(stage: PlannedStage, survey: Survey, given: Any) -> tuple[Survey, lis
     for path in variables:
         if not any(fnmatchcase(path, pattern) for pattern in promised):
             raise UsageError(f"stage {stage.name} gives {path}, which it does not declare")
-    for pattern in stage.declares.gives:
-        if not any(fnmatchcase(path, pattern) for path in variables):
-            raise UsageError(f"stage {stage.name} declares that it gives {pattern}, but did not")
+    _require_promised(stage, variables)
     return survey.merged(variables, flags), list(variables)
+
+
+def _require_promised(stage: PlannedStage, given: Iterable[str]) -> None:
+    paths = list(given)
+    for pattern in stage.declares.gives:
+        if not any(fnmatchcase(path, pattern) for path in paths):
+            raise UsageError(f"stage {stage.name} declares that it gives {pattern}, but did not")
