@@ -17,6 +17,7 @@ from magtensor.report.tables import compact, count, number, pretty, with_std
     [
         (0.30097, "0.3010"), (0.01, "0.01"), (-1234.56, "−1235"), (0, "0"), (1.5e-7, "1.500 × 10⁻⁷"),
         (-2.5e9, "−2.500 × 10⁹"), (math.nan, "–"), (None, "–"), (math.inf, "∞"), ("x", "–"), (True, "–"), (7, "7"),
+        (9.99999, "10.00"),
     ],
 )  # fmt: skip
 def test_number(value: object, text: str) -> None:

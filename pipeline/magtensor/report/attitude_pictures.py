@@ -36,8 +36,8 @@ def coverage(unit: Array, residual: Array | None, sensors: list[str]) -> Figure:
     """
     across = 1 if len(sensors) == 1 else 2 if len(sensors) <= 4 else 3
     rows = -(-len(sensors) // across)
-    figure, axes_grid = panels(rows, 2 * across, {1: 2.6, 2: 2.1, 3: 1.4}[across], gap=0.1, between=0.08)
-    figure.subplots_adjust(left=0.02, right=1 - 0.95 / WIDTH, bottom=0.1 / figure.get_figheight())
+    height = {1: 2.8, 2: 2.3, 3: 1.5}[across]
+    figure, axes_grid = panels(rows, 2 * across, height, gap=0.05, between=0.08, left=0.05, right=1.1)
     grid = axes_grid.ravel()
     maps: list[AxesImage] = []
     for i, name in enumerate(sensors):
@@ -55,7 +55,7 @@ def coverage(unit: Array, residual: Array | None, sensors: list[str]) -> Figure:
     for image in maps:
         image.set_clim(-limit, limit)
     tall = 1.8 / figure.get_figheight()
-    beside = figure.add_axes((1 - 0.8 / WIDTH, 0.48 - tall / 2, 0.12 / WIDTH, tall))
+    beside = figure.add_axes((1 - 0.8 / WIDTH, 0.5 - tall / 2, 0.12 / WIDTH, tall))
     bar = figure.colorbar(maps[0], cax=beside, extend="both")
     bar.set_label("mean of |b| − F  (nT)")
     bar.outline.set_visible(False)

@@ -113,13 +113,28 @@ class Content:
         return str(self.attributes("calibration/matrix").get("frame", ""))
 
     @cached_property
+    def noise_of_axes(self) -> Array:
+        """(S, 3) nT white noise of each axis, as stored or else found from the calibrated field; NaN where unknown."""
+        from magtensor.calibration.noise import noise_std
+
+        stored, b = self.variable("calibration/noise_std"), self.in_use("calibrated/b")
+        if stored is not None or b is None:
+            return stored if stored is not None else np.full((len(self.sensors), 3), np.nan)
+        residual = self.in_use("residual/total_field")
+        if residual is not None:  # sensor by sensor: they need not share a frame
+            found = np.full(b.shape[1:], np.nan)
+            for i in range(b.shape[1]):
+                known = np.isfinite(b[:, i]).all(axis=1) & np.isfinite(residual[:, i])
+                field = b[known, i : i + 1]
+                found[i] = noise_std(field, np.linalg.norm(field[:, 0], axis=1) - residual[known, i])
+            return found
+        whole = np.isfinite(b).all(axis=(1, 2))
+        return noise_std(b[whole]) if "residual/contrast" in self.survey else np.full(b.shape[1:], np.nan)
+
+    @cached_property
     def noise(self) -> Array:
-        """(S,) nT noise of each sensor, rms over its axes; NaN where unknown."""
-        noise = self.variable("calibration/noise_std")
-        if noise is None:
-            return np.full(len(self.sensors), np.nan)
-        known = np.isfinite(noise).all(axis=1)
-        return np.where(known, np.sqrt(np.mean(np.where(np.isfinite(noise), noise, 0.0) ** 2, axis=1)), np.nan)
+        """(S,) nT noise of each sensor, rms over its axes; NaN where one is unknown."""
+        return np.asarray(np.sqrt(np.mean(self.noise_of_axes**2, axis=1)))
 
 
 def decoded(text: Any) -> Any:

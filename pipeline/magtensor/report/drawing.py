@@ -105,7 +105,7 @@ def _scheme() -> str:
 
 def panels(
     rows: int, columns: int, row_height: float, *, top: float = 0.06, gap: float = 0.85, between: float = 0.12,
-    **options: Any,
+    left: float = LEFT, right: float = RIGHT, **options: Any,
 ) -> tuple[Figure, Any]:  # fmt: skip
     """A figure of the page's width with a grid of axes, laid out by rule: no drawing is needed to place anything.
 
@@ -114,6 +114,7 @@ def panels(
         row_height: inches of an axes' height; a title stands above each.
         top: inches kept free for a legend.
         gap: inches between columns; between: inches between rows, beside the room for a title.
+        left, right: inches of the margins.
         options: for `Figure.subplots`.
 
     Returns:
@@ -126,10 +127,9 @@ def panels(
     height = top + rows * step - between + BOTTOM
     figure = NewFigure(figsize=(WIDTH, height), dpi=96)
     FigureCanvasAgg(figure)
-    inner = WIDTH - LEFT - RIGHT
-    across = (inner - gap * (columns - 1)) / columns
+    across = (WIDTH - left - right - gap * (columns - 1)) / columns
     grid = {
-        "left": LEFT / WIDTH, "right": 1 - RIGHT / WIDTH, "bottom": BOTTOM / height, "top": 1 - (top + TITLE) / height,
+        "left": left / WIDTH, "right": 1 - right / WIDTH, "bottom": BOTTOM / height, "top": 1 - (top + TITLE) / height,
         "wspace": gap / across, "hspace": (TITLE + between) / row_height,
     }  # fmt: skip
     return figure, figure.subplots(rows, columns, squeeze=False, gridspec_kw=grid, **options)

@@ -9,7 +9,7 @@ import numpy as np
 
 from magtensor.calibration.types import Array
 from magtensor.report.clock import clock
-from magtensor.report.drawing import WASH, WIDTH, colour, label, panels
+from magtensor.report.drawing import WASH, colour, label, panels
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -43,8 +43,7 @@ def ribbon(time: Array, units: str, flags: Sequence[Mapping[str, Any]], sensors:
     rows = ["", *sensors] if any(not f["sensor"] for f in flags) else list(sensors)
     known = reasons(flags)
     axis = clock(time, units)
-    figure, grid = panels(1, 1, 0.24 * len(rows), top=0.2 * min(len(known), MOST_REASONS))
-    figure.subplots_adjust(left=1.6 / WIDTH)
+    figure, grid = panels(1, 1, 0.24 * len(rows), top=0.2 * min(len(known), MOST_REASONS), left=1.9)
     axes = grid[0, 0]
     end = float(axis.values[-1]) if len(axis.values) else 0.0
     span = end if end > 0 else 1.0

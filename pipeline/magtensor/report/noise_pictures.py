@@ -78,7 +78,8 @@ def spectra(found: list[Curves], step: float, sensors: list[str]) -> Figure:
     """
     from matplotlib.lines import Line2D
 
-    names = [*sensors, "white noise"]
+    known = any(np.isfinite(shown.noise).any() for shown in found)
+    names = [*sensors, "white noise"] if known else sensors
     figure, grid = panels(1, len(found), 2.3, top=legend_height(names) - 0.1)
     for axes, shown in zip(grid[0], found, strict=True):
         _spectrum_panel(axes, shown.of, shown.noise * np.sqrt(2 * step * shown.summed))
@@ -87,7 +88,7 @@ def spectra(found: list[Curves], step: float, sensors: list[str]) -> Figure:
     grid[0, 0].set_ylabel("nT / √Hz")
     handles = [Line2D([], [], color=colour(i), linewidth=2) for i in range(len(sensors))]
     floor = Line2D([], [], color=MUTED, linewidth=1.2, linestyle=(0, (4, 3)))
-    legend(figure, [*handles, floor], names)
+    legend(figure, [*handles, floor] if known else handles, names)
     return figure
 
 

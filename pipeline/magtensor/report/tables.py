@@ -58,11 +58,10 @@ def number(value: Any, digits: int = 4) -> str:
         return "∞" if value > 0 else "−∞"
     if value == 0:
         return "0"
-    power = math.floor(math.log10(abs(value)))
+    mantissa, exponent = f"{value:.{digits - 1}e}".split("e")
+    power = int(exponent)
     if power >= 6 or power < -4:
-        mantissa, exponent = f"{value:.{digits - 1}e}".split("e")
-        return f"{mantissa} × 10{str(int(exponent)).translate(SUPERSCRIPTS)}".replace("-", "−")
-    # rounding may carry into the next power of ten, which then shows one digit too many: harmless
+        return f"{mantissa} × 10{str(power).translate(SUPERSCRIPTS)}".replace("-", "−")
     text = f"{value:.{max(digits - 1 - power, 0)}f}"
     if "." in text and float(text) == value:  # nothing was rounded: the zeros would claim a precision
         text = text.rstrip("0").rstrip(".")
@@ -142,8 +141,8 @@ def _raw_column(content: Content) -> list[tuple[str, Mapping[str, Any]]]:
 
 def _noise_column(content: Content) -> list[tuple[str, Mapping[str, Any]]]:
     """What the sensors' white noise alone would give: no calibration can do better."""
-    noise, gain = content.variable("calibration/noise_std"), content.variable("calibration/tensor_gain")
-    if noise is None or not np.isfinite(noise).all():
+    noise, gain = content.noise_of_axes, content.variable("calibration/tensor_gain")
+    if not noise.size or not np.isfinite(noise).all():
         return []
     each = content.noise
     block: dict[str, Any] = {
@@ -268,8 +267,8 @@ def per_sensor(content: Content) -> Table | None:
                 title = str(dataset[name].attrs.get("long_name", name.replace("_", " ")))
                 units = pretty(str(dataset[name].attrs.get("units", "")))
                 rows.append(Row(title, units, [number(v) for v in values]))
-    noise = content.variable("calibration/noise_std")
-    if noise is not None:
+    noise = content.noise_of_axes
+    if np.isfinite(noise).any():
         rows += [Row(f"noise of axis {a}", "nT", [number(v) for v in noise[:, k]]) for k, a in enumerate("xyz")]
     return Table(content.sensors, [("", rows)]) if rows else None
 

@@ -13,7 +13,6 @@ from magtensor.report.drawing import (
     INK,
     MUTED,
     WASH,
-    WIDTH,
     around,
     colour,
     label,
@@ -44,8 +43,7 @@ def total_field_residual(
         sensors: S names.
     """
     count = len(sensors)
-    figure, grid = panels(count, 2, 0.9, gap=0.2, sharex=True, width_ratios=(4.2, 1.0))
-    figure.subplots_adjust(right=1 - 0.6 / WIDTH)
+    figure, grid = panels(count, 2, 0.9, gap=0.2, right=0.62, sharex=True, width_ratios=(4.2, 1.0))
     axis = clock(time, units)
     for i, (main, small) in enumerate(grid):
         if np.isfinite(noise[i]):
@@ -146,7 +144,7 @@ def invariants(time: Array, units: str, values: Array, std: Array | None, names:
 def reference(time: Array, units: str, total_field: Array | None, diurnal: Array | None) -> Figure:
     """The total field the sensors were held against, and the diurnal variation taken off. (N,) nT each."""
     shown = [(v, w) for v, w in ((total_field, "total field F"), (diurnal, "diurnal variation")) if v is not None]
-    figure, grid = panels(len(shown), 1, 1.05, sharex=True)
+    figure, grid = panels(len(shown), 1, 1.05, left=1.0, sharex=True)  # five digits and more stand at the left
     axis = clock(time, units)
     for i, (axes, (values, words)) in enumerate(zip(grid[:, 0], shown, strict=True)):
         trace(axes, axis.values, values, colour(i))

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 
 from magtensor import result
 from magtensor.calibrated import contrasts, corrected, stored
@@ -134,22 +132,9 @@ def quality() -> dict[str, Any]:
     }
 
 
-@pytest.fixture(scope="session")
-def whole_survey() -> Survey:
-    return calibrated_survey()
-
-
-@pytest.fixture
-def written(tmp_path: Path) -> Callable[..., Path]:
-    """Write a survey as a finished run would, without the page; the folder."""
-
-    def write(survey: Survey, outcome: dict[str, Any] | None = None, **changes: Any) -> Path:
-        folder = tmp_path / "run"
-        made_by = provenance(**changes)
-        tree = result.result_tree(survey)
-        folder.mkdir(exist_ok=True)
-        result._save(tree, made_by, folder / result.RESULT)
-        (folder / result.VERDICT).write_text(json.dumps(outcome or verdict(survey)))
-        return folder
-
-    return write
+def save(folder: Path, survey: Survey, outcome: dict[str, Any] | None = None, **changes: Any) -> Path:
+    """The files of a finished run without the page; `changes` are to the provenance."""
+    folder.mkdir(exist_ok=True)
+    result._save(result.result_tree(survey), provenance(**changes), folder / result.RESULT)
+    (folder / result.VERDICT).write_text(json.dumps(outcome or verdict(survey)))
+    return folder
