@@ -54,8 +54,18 @@ class Provenance:
 
     @classmethod
     def from_attributes(cls, attributes: Mapping[str, Any]) -> Provenance:
-        """The inverse of `attributes`."""
+        """The inverse of `attributes`.
+
+        Raises:
+            KeyError, ValueError: the attributes are not what `attributes` made.
+        """
         parts = {k: json.loads(attributes[k]) for k in ("recipe", "inputs", "versions", "plugins", "stages", "notes")}
+        for name in ("inputs", "plugins", "stages"):
+            if not isinstance(parts[name], list) or not all(isinstance(entry, dict) for entry in parts[name]):
+                raise ValueError(f"{name} is no list of mappings")
+        for name in ("versions", "notes"):
+            if not isinstance(parts[name], dict):
+                raise ValueError(f"{name} is no mapping")
         return cls(**parts, content_sha256=str(attributes["content_sha256"]))
 
 
@@ -165,12 +175,16 @@ def differences(then: Provenance, now: Provenance) -> list[str]:
         for name, old in then.versions.items()
         if now.versions.get(name) != old
     ]
-    current = {p["name"]: p for p in now.plugins}
+    current = {_plugin_label(p): p for p in now.plugins}
     for plugin in then.plugins:
-        name = plugin["name"]
+        label = _plugin_label(plugin)
         for key in ("version", "sha256"):
-            if key in plugin and current.get(name, {}).get(key) != plugin[key]:
-                lines.append(
-                    f"plugin {name}: {key} was {plugin[key]}, is {current.get(name, {}).get(key, 'not there')}"
-                )
+            found = current.get(label, {}).get(key, "not there")
+            if key in plugin and found != plugin[key]:
+                lines.append(f"plugin {label}: {key} was {plugin[key]}, is {found}")
     return lines
+
+
+def _plugin_label(plugin: Mapping[str, str]) -> str:
+    """Its name, with the distribution: many packages call their entry point `stages`."""
+    return f"{plugin['name']} of {plugin['distribution']}" if plugin.get("distribution") else plugin["name"]
