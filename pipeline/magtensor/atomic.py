@@ -8,12 +8,14 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from magtensor.errors import UsageError
+
 
 @contextmanager
 def atomic_path(path: Path) -> Iterator[Path]:
     """A temporary path in the same folder; renamed to `path` when the block ends well, removed when not."""
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
+    _make(path.parent)
     temporary = path.with_name(f".{path.name}.partial-{os.getpid()}")
     try:
         yield temporary
@@ -37,7 +39,7 @@ def atomic_set(directory: Path, last: str) -> Iterator[Path]:
     place: where it is present, the set is whole.
     """
     directory = Path(directory)
-    directory.mkdir(parents=True, exist_ok=True)
+    _make(directory)
     partial = directory / f".partial-{os.getpid()}"
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir()
@@ -50,3 +52,23 @@ def atomic_set(directory: Path, last: str) -> Iterator[Path]:
             os.replace(partial / name, directory / name)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
+
+
+def require_writable(directory: Path) -> None:
+    """See that a folder can be written, or made, before hours are spent on what is to go there.
+
+    Raises:
+        UsageError: it cannot.
+    """
+    place = next(p for p in (Path(directory).resolve(), *Path(directory).resolve().parents) if p.exists())
+    if not place.is_dir():
+        raise UsageError(f"{directory}: cannot be written: {place} is no folder")
+    if not os.access(place, os.W_OK | os.X_OK):
+        raise UsageError(f"{directory}: cannot be written: no permission to write into {place}")
+
+
+def _make(directory: Path) -> None:
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UsageError(f"{directory}: cannot be written: {error.strerror or error}") from error

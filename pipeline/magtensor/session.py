@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from magtensor import provenance, result
+from magtensor.atomic import require_writable
 from magtensor.errors import DataError
 from magtensor.provenance import Provenance
 from magtensor.recipe.plan import Plan, plan, read_plan
@@ -89,6 +90,7 @@ def run_plan(
     planned: Plan, output: Path, *, verify: Path | None = None, progress: Callable[[str], None] | None = None
 ) -> Finished:
     """Run a plan and write the files of the contract; as `run_recipe`."""
+    require_writable(output)
     source = planned.source()
     if progress is not None:
         progress("start")
@@ -130,31 +132,45 @@ def is_hdf5(path: Path) -> bool:
         return False
 
 
-def verification(calibrated: Survey, path: Path, planned: Plan) -> dict[str, Any] | None:
-    """The error block of another survey, with the calibration just made."""
-    return survey_block(apply_to(calibrated, path, planned))
+def verification(calibrated: Survey, path: Path, planned: Plan) -> dict[str, Any]:
+    """The error blocks of another survey: with the declared model alone, and with all that was adopted."""
+    after = survey_block(apply_to(calibrated, path, planned))
+    before = after
+    if "declared/matrix" in calibrated and "calibration/effects" in calibrated:
+        before = survey_block(apply_to(with_declared_alone(calibrated), path, planned))
+    return {"before": before, "after": after}
+
+
+def with_declared_alone(calibrated: Survey) -> Survey:
+    """The calibration before anything was adopted: its own C and o, no effects."""
+    from magtensor.survey.model import without_variables
+
+    variables = {
+        f"calibration/{name}": (calibrated[f"calibration/{name}"].dims, calibrated.values(f"declared/{name}"), {})
+        for name in ("matrix", "offset")
+    }
+    matrix = calibrated["calibration/matrix"]
+    variables["calibration/matrix"] = (matrix.dims, calibrated.values("declared/matrix"), dict(matrix.attrs))
+    return without_variables(calibrated, "calibration/effects").merged(variables)
 
 
 def apply_to(calibration: Survey, path: Path, planned: Plan, *, tolerant: bool = False) -> Survey:
     """Another survey, loaded as the recipe loads and corrected with a calibration; `tolerant` as in `load_as`."""
     from magtensor.calibrated import corrected, require_sensors, restored
-    from magtensor.tensor.elements import five
-    from magtensor.tensors import assembled, refined, refinement_noise, stored_assembly, stored_refinement
+    from magtensor.loop.stored import cleaned, stored_effects
+    from magtensor.tensors import assembled, stored_assembly, stored_refinement
 
     survey = load_as(planned, path, tolerant=tolerant)
-    refinement = stored_refinement(calibration)
-    if "calibration/matrix" in calibration:
-        require_sensors(survey, result.sensors_of(calibration), str(path))
-        fitted = restored(calibration)
-        survey = survey.merged(corrected(fitted, survey))
-        if "calibration/tensor_gain" in calibration:
-            b, noise = survey.values("calibrated/b"), calibration.values("calibration/noise_std")
-            position = calibration.values("calibration/position")
-            assembly = stored_assembly(calibration)
-            survey = survey.merged(assembled(assembly, b, position, noise, fitted, refinement))
-    elif refinement is not None:
-        measured = five(survey.values("calibrated/tensor"))
-        survey = survey.merged(refined(measured, refinement_noise(calibration), refinement))
+    require_sensors(survey, result.sensors_of(calibration), str(path))
+    fitted = restored(calibration)
+    survey = cleaned(survey, fitted, *stored_effects(calibration, planned.registry))
+    survey = survey.merged(corrected(fitted, survey))
+    if "calibration/tensor_gain" in calibration:
+        b, noise = survey.values("calibrated/b"), calibration.values("calibration/noise_std")
+        position = calibration.values("calibration/position")
+        survey = survey.merged(
+            assembled(stored_assembly(calibration), b, position, noise, fitted, stored_refinement(calibration))
+        )
     return survey
 
 
@@ -201,11 +217,12 @@ def apply(calibration: Path, survey: Path, output: Path | None = None) -> Path:
     Returns:
         The file written.
     """
+    target = output or survey.with_name(f"{survey.stem}.calibrated.nc")
+    require_writable(target.parent)
     stored = result.open_result(calibration)
     made_by = provenance.read(calibration)
     planned = again(calibration, made_by)
     found = apply_to(stored, survey, planned, tolerant=True)
-    target = output or survey.with_name(f"{survey.stem}.calibrated.nc")
     inputs = [provenance.file_facts(survey), provenance.file_facts(calibration)]
     applied = Provenance(
         made_by.recipe, inputs, provenance.versions(), made_by.plugins, made_by.stages,
