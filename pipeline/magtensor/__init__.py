@@ -13,12 +13,14 @@ _LAZY = {
     "error_model": "magtensor.components",
     "MethodChoice": "magtensor.components",
     "MetricsChoice": "magtensor.components",
+    "ErrorModelsChoice": "magtensor.components",
     "DataError": "magtensor.errors",
     "UsageError": "magtensor.errors",
     "NotEnoughData": "magtensor.errors",
 }
 __all__ = [
     "DataError",
+    "ErrorModelsChoice",
     "MethodChoice",
     "MetricsChoice",
     "NotEnoughData",
@@ -32,7 +34,16 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
-    from magtensor.components import MethodChoice, MetricsChoice, error_model, method, metric, reader, stage
+    from magtensor.components import (
+        ErrorModelsChoice,
+        MethodChoice,
+        MetricsChoice,
+        error_model,
+        method,
+        metric,
+        reader,
+        stage,
+    )
     from magtensor.errors import DataError, NotEnoughData, UsageError
 
 

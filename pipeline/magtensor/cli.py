@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 from pathlib import Path
 from typing import Any
@@ -187,6 +188,10 @@ def main(arguments: list[str] | None = None) -> None:
 
 def status_of(arguments: list[str] | None = None) -> int:
     """Run the command line; a user's mistake is one message, a bug keeps its traceback (exit status 1)."""
+    # one BLAS thread: the matrices are tall and narrow, where more threads only wait for each other, and sums in one
+    # order give the same bits again
+    for variable in ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS"):
+        os.environ.setdefault(variable, "1")
     try:
         outcome = cli.main(args=arguments, prog_name="magtensor", standalone_mode=False)
     except click.ClickException as error:

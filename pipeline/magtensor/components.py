@@ -40,6 +40,13 @@ MethodChoice = Annotated[
 MetricsChoice = Annotated[Any, Metrics()]  # names in the recipe, {name: function} in the stage
 
 
+class ErrorModels:
+    """Marks an option of a stage that names error models; see `ErrorModelsChoice`."""
+
+
+ErrorModelsChoice = Annotated[Any, ErrorModels()]  # names in the recipe, {name: (component, settings given)} in the stage
+
+
 class PluginError(Exception):
     """A plugin breaks the rules; the message says which and what would be right."""
 
@@ -109,9 +116,15 @@ class Component:
         return None
 
     @cached_property
-    def metrics_option(self) -> str | None:
-        """The option that names metrics; None for a stage without."""
-        return self._marked_with(Metrics)
+    def collections(self) -> dict[str, str]:
+        """The options that name several components, with the kind they name."""
+        kinds = {Metrics: "metric", ErrorModels: "error_model"}
+        return {
+            name: kind
+            for name, p in self.parameters.items()
+            for marker, kind in kinds.items()
+            if any(isinstance(a, marker) for a in getattr(p.annotation, "__metadata__", ()))
+        }
 
     @cached_property
     def method_option(self) -> tuple[str, str | None] | None:
@@ -127,7 +140,7 @@ class Component:
         """The pydantic model of the options, those that name methods or metrics left out."""
         from pydantic import ConfigDict, create_model
 
-        components = {self.metrics_option, self.method_option[0] if self.method_option else None}
+        components = {*self.collections, self.method_option[0] if self.method_option else None}
         fields: dict[str, Any] = {
             name: (p.annotation, ... if p.default is inspect.Parameter.empty else p.default)
             for name, p in self.parameters.items()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from typing import Any
 
 from magtensor.accuracy import error_block
@@ -11,16 +12,15 @@ SCHEMA = 1
 
 
 def verdict(survey: Survey, verify: dict[str, Any] | None = None) -> dict[str, Any]:
-    """The outcome of a run without the loop: the declared model and its errors, nothing searched for.
+    """The outcome of a run: of the loop where the recipe closes it, else of the declared model alone.
 
     Args:
         survey: after the last stage.
-        verify: the error block of a verification survey.
+        verify: `{"before": block, "after": block}` of a verification survey.
     """
-    block = survey_block(survey)
     found: dict[str, Any] = {
         "schema": SCHEMA,
-        "declared": ["linear"] if {"calibration/matrix", "calibration/tensor_matrix"} & set(survey) else [],
+        "declared": ["linear"] if "calibration/matrix" in survey else [],
         "noise_floor_nT": noise_floor(survey),
         "adopted": [],
         "rejected": [],
@@ -31,10 +31,14 @@ def verdict(survey: Survey, verify: dict[str, Any] | None = None) -> dict[str, A
             "description": "not looked for: the recipe closes no loop",
             "looks_like": [],
         },
-        "error": {"fit": block},
+        "error": {"fit": survey_block(survey)},
     }
+    if "loop/verdict" in survey:
+        loop = json.loads(str(survey.values("loop/verdict")))
+        found["error"]["held_out"] = loop.pop("held_out")
+        found |= loop
     if verify is not None:
-        found["error"]["verify"] = {"before": verify, "after": verify}
+        found["error"]["verify"] = verify
     return found
 
 
@@ -64,22 +68,51 @@ def noise_floor(survey: Survey) -> float | None:
 
 def sentence(outcome: dict[str, Any]) -> str:
     """The verdict in one sentence."""
-    parts = []
-    block = outcome["error"].get("verify", {}).get("after") or outcome["error"].get("fit")
-    if not block and not outcome["declared"]:
+    where, before, after = _judged(outcome)
+    if after is None:
         return "Nothing was calibrated."
-    if not block:
-        return "The tensor was refined; its error cannot be told without a tensor that is known."
-    where = "on the verification survey" if "verify" in outcome["error"] else "on the survey it was fitted to"
-    if block["total_field_rms_nT"]:
-        parts.append(f"total field {_figure(block['total_field_rms_nT']['all'])} nT rms")
-    if block["tensor_rms_nT_per_m"]:
-        parts.append(f"tensor {_figure(block['tensor_rms_nT_per_m']['all'])} nT/m rms")
+    figures = [
+        f"{name} {_change(before, after, key)} {unit} rms"
+        for name, key, unit in (
+            ("total field", "total_field_rms_nT", "nT"),
+            ("tensor", "tensor_rms_nT_per_m", "nT/m"),
+        )
+        if after.get(key)
+    ]
     floor = outcome["noise_floor_nT"]
     noise = f"; sensor noise {_figure(floor)} nT" if floor is not None else ""
-    if not parts:
-        return f"Calibrated; no error figure can be given without a total field or three sensors{noise}."
-    return f"Calibrated with {' and '.join(outcome['declared'])}: {', '.join(parts)} {where}{noise}."
+    told = f"{', '.join(figures)} {where}{noise}" if figures else f"no error figure can be given{noise}"
+    model = " and ".join(outcome["declared"]) or "no model"
+    adopted = [a["error_model"] for a in outcome["adopted"]]
+    left = outcome["unexplained"]
+    if adopted:
+        head = f"The residual was traced to {', '.join(adopted)}"
+    elif left["present"] is None:
+        head = f"Calibrated with {model}"
+    elif left["present"]:
+        head = f"Calibrated with {model}; a residual remains that no known effect explains"
+    else:
+        head = f"Calibrated with {model}; nothing is left that asks for another effect"
+    tail = f"; unexplained: {left['description']}" if left["present"] else ""
+    return f"{head}: {told}{tail}."
+
+
+def _judged(outcome: dict[str, Any]) -> tuple[str, dict[str, Any] | None, dict[str, Any] | None]:
+    """Where the error was judged, and the blocks before and after, the most honest there is."""
+    error = outcome["error"]
+    for key, where in (("verify", "on the verification survey"), ("held_out", "on held-out blocks")):
+        blocks = error.get(key)
+        if blocks and blocks.get("after"):
+            return where, blocks["before"], blocks["after"]
+    return "on the survey it was fitted to", None, error.get("fit")
+
+
+def _change(before: dict[str, Any] | None, after: dict[str, Any], key: str) -> str:
+    now = _figure(after[key]["all"])
+    if not before or not before.get(key):
+        return now
+    then = _figure(before[key]["all"])
+    return now if then == now else f"{then} -> {now}"
 
 
 def _figure(value: float | None) -> str:

@@ -13,6 +13,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from magtensor.errors import NotEnoughData
 
@@ -51,6 +52,7 @@ def fit_joint(
     reference_noise: float = 0.0,
     robust: bool = True,
     worst_error: float = WORST_ERROR,
+    keep: NDArray[np.bool_] | None = None,
 ) -> JointFit:
     """Fit C and o of all sensors to their outputs and the total field.
 
@@ -62,12 +64,14 @@ def fit_joint(
     reference_noise: nT, white, of the total field.
     robust: leave out samples that no noise explains.
     worst_error: see `coverage.coverage`.
+    keep: (N,) the samples to believe; judged here when None.
 
     Raises
     ------
     NotEnoughData: the attitudes do not determine the parameters; the message says which are missing.
     """
-    keep = np.ones(len(raw), dtype=bool)
+    judge = keep is None and robust and len(raw) >= LEAST_FOR_REJECTION
+    keep = np.ones(len(raw), dtype=bool) if keep is None else keep
     sensors = raw.shape[1]
     given = output_noise(raw) if noise is None and sensors > 1 and len(raw) >= LEAST_FOR_REJECTION else noise
     for _ in range(20):
@@ -80,7 +84,7 @@ def fit_joint(
             plane = common_field(raw, given, keep)
             y = plane.coordinates(raw)
             scalar = fit_scalar(y[keep], total_field[keep], reference_noise)
-        if not robust or len(raw) < LEAST_FOR_REJECTION:
+        if not judge:
             break
         again = _believable(plane, scalar, raw, total_field, reference_noise, keep)
         if np.array_equal(again, keep):
@@ -93,9 +97,11 @@ def fit_joint(
         keep = again
         if sensors == 1 and noise is None:
             given = None
-    seen = coverage(y[keep], total_field[keep], matrix=scalar.matrix, offset=scalar.offset, worst_error=worst_error)
-    require_coverage(seen)
     forward, offset = _unfold(plane, scalar, sensors)
+    # judged on the calibrated field, whose axes are nearest to those of the sensors
+    field = (y[keep] - scalar.offset) @ scalar.matrix.T @ nearest_frame(forward)
+    seen = coverage(field, total_field[keep], matrix=np.eye(3), offset=np.zeros(3), worst_error=worst_error)
+    require_coverage(seen)
     return JointFit(forward, offset, plane, scalar, keep)
 
 

@@ -10,7 +10,7 @@ from magtensor.calibration.types import Array
 from magtensor.loop.colour import Colour, colour_of
 from magtensor.loop.evidence import Grams, grams, normal
 from magtensor.loop.residual import Residual, taken_off
-from magtensor.loop.statistics import Estimate, Gain, held_out_gain, own_information, solve, wald_p
+from magtensor.loop.statistics import Estimate, Gain, family_p, held_out_gain, own_information, solve
 from magtensor.loop.terms import Terms
 
 FINEST_BLOCKS = 120
@@ -83,7 +83,8 @@ def assess(residual: Residual, terms: Terms, colours: Colours, *, significance: 
     n, y = normal(blocks.total())
     estimate = solve(n[0], y[0], own_information(blocks))
     gain = held_out_gain(blocks, residual.freedom)
-    return Assessment(estimate, gain, wald_p(blocks) if significance else float("nan"), blocks, colours)
+    p = family_p(blocks, terms.sensors) if significance else float("nan")
+    return Assessment(estimate, gain, p, blocks, colours)
 
 
 def estimated(residual: Residual, terms: Terms, colours: Colours) -> Estimate:

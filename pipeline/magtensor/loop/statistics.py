@@ -14,6 +14,9 @@ from magtensor.loop.evidence import Grams, held_out, normal
 IDENTIFIABLE = 1e-6  # of a regressor's own information: a direction with less left is not estimated
 BLOCK_COUNTS = (100, 30, 12)  # long blocks protect against correlation longer than a short block
 FOLDS = 10
+LEAST_T = 2.0  # paired t of the held-out gain over folds
+LEAST_SHARE_OF_FOLDS = 0.8  # a strong slow effect gains very unevenly, which keeps t low, but it gains nearly everywhere
+LEAST_LEFT = 1e-3  # of the information in a direction, without any one block
 
 
 @dataclass(frozen=True)
@@ -91,7 +94,9 @@ def wald_p(g: Grams, subset: Sequence[int] | None = None) -> float:
     p = basis.shape[1]
     if p == 0:
         return 1.0
-    theta = np.linalg.solve(basis.T @ reduced_n[0] @ basis, basis.T @ reduced_y[0])
+    information = basis.T @ reduced_n[0] @ basis
+    theta = np.linalg.solve(information, basis.T @ reduced_y[0])
+    unit = np.sqrt(np.diag(information))
     worst = 0.0
     tried = False
     finest = len(g.zz)
@@ -102,6 +107,8 @@ def wald_p(g: Grams, subset: Sequence[int] | None = None) -> float:
         n, y = normal(part.without_each())
         n, y = _without_others(n, y, chosen, scale)
         small, right = basis.T @ n @ basis, y @ basis
+        if np.linalg.eigvalsh(small / np.outer(unit, unit))[:, 0].min() < LEAST_LEFT:
+            return 1.0  # a single block holds nearly all there is to know: nothing can confirm it
         try:
             each = np.linalg.solve(small, right[:, :, None])[:, :, 0]
         except np.linalg.LinAlgError:
@@ -116,6 +123,22 @@ def wald_p(g: Grams, subset: Sequence[int] | None = None) -> float:
         worst = max(worst, float(f_distribution.sf(statistic, p, count - p)))
         tried = True
     return worst if tried else 1.0
+
+
+def family_p(g: Grams, sensors: Sequence[str], subset: Sequence[int] | None = None) -> float:
+    """P value of a family of terms: jointly, or sensor by sensor where there are too many for the blocks.
+
+    Parameters
+    ----------
+    sensors: (P,) whose each term is.
+    """
+    chosen = list(range(g.count)) if subset is None else list(subset)
+    if 3 * len(chosen) <= len(g.zz):
+        return wald_p(g, chosen)
+    groups = [[i for i in chosen if sensors[i] == name] for name in dict.fromkeys(sensors[i] for i in chosen)]
+    if len(groups) == 1:
+        return wald_p(g, chosen)
+    return cauchy_combination([wald_p(g, group) for group in groups])
 
 
 def _without_others(n: Array, y: Array, chosen: NDArray[np.int_], scale: Array) -> tuple[Array, Array]:
@@ -166,6 +189,12 @@ class Gain:
         each = (self.before - self.after) / self.values
         spread = float(each.std(ddof=1))
         return float(each.mean() / (spread / np.sqrt(len(each)))) if spread > 0 else 0.0
+
+    @property
+    def consistent(self) -> bool:
+        """Whether the gain is there in nearly every fold, or on average by more than its scatter explains."""
+        better = (self.before > self.after).mean()
+        return self.total > 0 and (self.t > LEAST_T or better >= LEAST_SHARE_OF_FOLDS)
 
     @property
     def rms(self) -> tuple[float, float]:

@@ -356,12 +356,13 @@ class _Planner:
         described: dict[str, Any] = {}
         rest = dict(options)
         whole = True  # one mistake must not hide the others: go on to the end, then give up
-        if component.metrics_option is not None:
-            found = self.metrics(component.metrics_option, rest.pop(component.metrics_option, None), at)
+        for option, kind in component.collections.items():
+            default = component.parameters[option].default
+            found = self.collection(kind, option, rest.pop(option, default), at)
             if found is None:
                 whole = False
             else:
-                bound[component.metrics_option], described[component.metrics_option], used = found
+                bound[option], described[option], used = found
                 taken += used
         if component.method_option is not None:
             option, default = component.method_option
@@ -409,31 +410,37 @@ class _Planner:
             return None
         return self.registry.find("method", str(name), stage.name)
 
-    def metrics(
-        self, option: str, wanted: Any, at: Location
-    ) -> tuple[dict[str, Callable[..., Any]], dict[str, Any], list[Component]] | None:
-        """A mapping `metric name: {options}`, or a list of names, or nothing for every metric there is."""
+    def collection(
+        self, kind: str, option: str, wanted: Any, at: Location
+    ) -> tuple[dict[str, Any], dict[str, Any], list[Component]] | None:
+        """A mapping `name: {options}`, or a list of names, or nothing for every metric or error model there is."""
+        word = kind.replace("_", " ")
         if wanted is None:
-            wanted = self.registry.names("metric")
-        if isinstance(wanted, list) and all(isinstance(w, str) for w in wanted):
+            wanted = self.registry.names(kind)
+        if isinstance(wanted, (list, tuple)) and all(isinstance(w, str) for w in wanted):
             wanted = {w: {} for w in wanted}
         if not isinstance(wanted, dict):
-            self.problems.add((*at, option), "must be a list of metrics, or a mapping `metric: {options}`")
+            self.problems.add((*at, option), f"must be a list of {word}s, or a mapping `{word}: {{options}}`")
             return None
-        bound: dict[str, Callable[..., Any]] = {}
+        bound: dict[str, Any] = {}
         described: dict[str, Any] = {}
         used = []
         for name, options in wanted.items():
             place = (*at, option, name)
-            if ("metric", "", str(name)) not in self.registry.components:
-                self.problems.add(place, self.registry.unknown("metric", str(name)))
+            if (kind, "", str(name)) not in self.registry.components:
+                self.problems.add(place, self.registry.unknown(kind, str(name)))
                 continue
-            metric = self.registry.find("metric", name)
-            model = self.problems.validated(metric.options, {} if options is None else options, place)
-            if model is not None:
-                bound[name] = functools.partial(metric.function, **_values(model))
+            one = self.registry.find(kind, name)
+            model = self.problems.validated(one.options, {} if options is None else options, place)
+            if model is None:
+                continue
+            used.append(one)
+            if kind == "error_model":  # what the recipe leaves open is searched, not set to its default
+                given = {k: v for k, v in _values(model).items() if k in (options or {})}
+                bound[name], described[name] = (one, given), {k: options[k] for k in given}
+            else:
+                bound[name] = functools.partial(one.function, **_values(model))
                 described[name] = model.model_dump(mode="json")
-                used.append(metric)
         return bound, described, used
 
     def check_flow(self, stages: Mapping[int, PlannedStage]) -> None:

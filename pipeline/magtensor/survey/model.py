@@ -147,3 +147,16 @@ class Survey:
         if "good" in self:
             return np.asarray(self.values("good"), dtype=bool)
         return np.ones((len(self.time), len(self.sensors)), dtype=bool)
+
+
+def without_variables(survey: Survey, *paths: str) -> Survey:
+    """The survey without some of its variables."""
+    from dataclasses import replace
+
+    import xarray as xr
+
+    nodes = {name: node.to_dataset() for name, node in survey.tree.children.items()}
+    for path in paths:
+        node, name = split_path(path)
+        nodes[node] = nodes[node].drop_vars(name)
+    return replace(survey, tree=xr.DataTree.from_dict({f"/{n}": d for n, d in nodes.items()}))

@@ -1,0 +1,65 @@
+"""The error before and after, with parameters that never saw the samples they are judged on."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from magtensor.accuracy import error_block
+from magtensor.calibration.joint import nearest_frame
+from magtensor.calibration.types import Array
+from magtensor.errors import NotEnoughData
+from magtensor.loop.model import Adopted, Fitting, Record, excitation_of, joint_state, without
+from magtensor.tensor.assembly import least_squares_assembly
+
+FOLDS = 5
+
+
+def held_out_error(record: Record, adopted: Sequence[Adopted], how: Fitting) -> dict[str, Any] | None:
+    """Error figures over contiguous folds, each calibrated with the samples of the others.
+
+    Parameters
+    ----------
+    record: the samples.
+    adopted: the error models, with their settings; their coefficients are fitted anew for every fold.
+
+    Returns
+    -------
+    The error block of `magtensor.accuracy.error_block`; None where the other folds do not determine a calibration.
+    """
+    n, sensors = len(record.time), len(record.sensors)
+    b = np.empty((n, sensors, 3))
+    reference = np.full(n, np.nan)
+    edges = np.linspace(0, n, FOLDS + 1).round().astype(int)
+    for k in range(FOLDS):
+        test = np.arange(edges[k], edges[k + 1])
+        train = np.setdiff1d(np.arange(n), test)
+        try:
+            state = joint_state(record.at(train), adopted, how)
+        except NotEnoughData:
+            return None
+        x = excitation_of(record, state.fit)
+        raw, field = without(record, [a.terms(x) for a in adopted], state.theta)
+        matrix = np.linalg.inv(state.fit.forward @ nearest_frame(state.fit.forward))
+        b[test] = np.einsum("sij,nsj->nsi", matrix, raw[test] - state.fit.offset)
+        if field is not None:
+            reference[test] = field[test]
+    return error_block(
+        b,
+        reference if record.total_field is not None else None,
+        tensor_of(b, record.position),
+        np.ones((n, sensors), dtype=bool),
+        list(record.sensors),
+    )
+
+
+def tensor_of(b: Array, position: Array | None) -> Array | None:
+    """(N, 3, 3) nT/m by least squares; None where the array cannot measure it."""
+    if position is None:
+        return None
+    try:
+        return least_squares_assembly(position).apply(b)
+    except NotEnoughData:
+        return None

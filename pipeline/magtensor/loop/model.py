@@ -1,0 +1,246 @@
+"""A calibration with error models: its data, its state, and the joint refit of everything."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magtensor.calibration.joint import JointFit, fit_joint, nearest_frame
+from magtensor.calibration.types import Array
+from magtensor.components import Component
+from magtensor.loop.assessment import Colours, colours_of, estimated
+from magtensor.loop.excitation import Excitation
+from magtensor.loop.residual import Residual, residual_of
+from magtensor.loop.statistics import Estimate
+from magtensor.loop.terms import Terms, joined
+
+_MOST_ROUNDS = 6
+LEAST_CLEARANCE = 10.0  # power over noise power of a frequency that a regressor may use
+_SETTLED = 0.02  # of a standard deviation
+
+
+@dataclass(frozen=True)
+class Record:
+    """The samples of a survey that the loop may use.
+
+    Attributes:
+        time: (N,) s; start: s, where the survey began.
+        raw: (N, S, 3) nT; total_field: (N,) nT or None.
+        quiet_field: (N,) nT, the total field without the reference's own noise, for regressors; None without one.
+        sensors: names.
+        logged: channels at the samples, their means taken off; means: those; units: of each.
+        run, segment: (N,) as in Excitation.
+        position: (S, 3) m or None; attitude: (N, 4) or None.
+        samples: (N,) their numbers in the survey.
+    """
+
+    time: Array
+    start: float
+    raw: Array
+    total_field: Array | None
+    quiet_field: Array | None
+    sensors: tuple[str, ...]
+    logged: Mapping[str, Array]
+    means: Mapping[str, Array]
+    units: Mapping[str, str]
+    run: NDArray[np.int_]
+    segment: NDArray[np.int_]
+    position: Array | None
+    attitude: Array | None
+    samples: NDArray[np.int_]
+
+    def at(self, keep: NDArray[np.int_]) -> Record:
+        """Some of the samples."""
+        return replace(
+            self,
+            time=self.time[keep],
+            raw=self.raw[keep],
+            total_field=None if self.total_field is None else self.total_field[keep],
+            quiet_field=None if self.quiet_field is None else self.quiet_field[keep],
+            logged={k: v[keep] for k, v in self.logged.items()},
+            run=self.run[keep],
+            segment=self.segment[keep],
+            attitude=None if self.attitude is None else self.attitude[keep],
+            samples=self.samples[keep],
+        )
+
+    def excitation(self, output: Array, field_: Array, lines: Sequence[float] = ()) -> Excitation:
+        """What error models see, given the modelled outputs and fields (N, S, 3)."""
+        return Excitation(
+            self.time, self.start, self.sensors, output, field_, self.quiet_field, self.logged, self.units, self.run, self.segment,
+            self.position, self.attitude, tuple(lines),
+        )  # fmt: skip
+
+
+def quieted(values: Array) -> Array:
+    """A reference record (N,), evenly sampled at its own times, without its own white noise: a Wiener filter.
+
+    A reference's noise is in the residual too; a regressor that held it would seem to explain it. So a frequency is
+    kept only where the record's power is well above the noise that second differences show.
+    """
+    from scipy.fft import dct, idct
+
+    n = len(values)
+    if n < 16:
+        return np.full(n, values.mean())
+    second = np.diff(values, n=2)
+    noise = float(np.median(second**2)) / 0.4549 / 6.0
+    trend = np.polynomial.Polynomial.fit(np.arange(n), values, 1)(np.arange(n))
+    coefficients = dct(values - trend, norm="ortho")
+    width = max(n // 100, 5)
+    smooth = np.convolve(coefficients**2, np.ones(width) / width, mode="same")
+    gain = np.where(smooth > LEAST_CLEARANCE * noise, 1.0 - noise / np.maximum(smooth, 1e-300), 0.0)
+    out: Array = idct(coefficients * gain, norm="ortho") + trend
+    return out
+
+
+@dataclass(frozen=True)
+class Adopted:
+    """An error model in the calibration.
+
+    Attributes:
+        component: the plugin's function with its kind.
+        settings: chosen values.
+        sensors: names of the sensors it acts on; () for one that is not of single sensors.
+    """
+
+    component: Component
+    settings: Mapping[str, Any]
+    sensors: tuple[str, ...] = ()
+
+    @property
+    def name(self) -> str:
+        return self.component.name
+
+    def terms(self, x: Excitation) -> Terms:
+        """Its regressors on a survey, those of other sensors left out."""
+        every: Terms = self.component.function(x, **self.settings)
+        if not self.sensors:
+            return every
+        return every.only(i for i, s in enumerate(every.sensors) if s in self.sensors or s == "")
+
+
+@dataclass(frozen=True)
+class State:
+    """A calibration with its error models, fitted.
+
+    Attributes:
+        adopted: the error models.
+        theta: coefficients of each.
+        fit: C and o.
+        residual: what is left, and its tangent space.
+        excitation: at all samples of the record.
+        terms: of all adopted models, at the residual's samples; None without any.
+        colours: of the residual.
+        estimate: of all coefficients together; None without any.
+    """
+
+    adopted: tuple[Adopted, ...]
+    theta: tuple[Array, ...]
+    fit: JointFit
+    residual: Residual
+    excitation: Excitation
+    terms: Terms | None
+    colours: Colours
+    estimate: Estimate | None = None
+    lines: tuple[float, ...] = field(default=())
+
+
+@dataclass(frozen=True)
+class Fitting:
+    """How the joint fit is made.
+
+    Attributes:
+        reference_noise: nT, of the total field.
+        worst_error: accepted predicted error of |b|, a fraction of F.
+        noise: (S, 3) nT or None.
+    """
+
+    reference_noise: float = 0.0
+    worst_error: float = 0.05
+    noise: Array | None = None
+
+
+def joint_state(
+    record: Record,
+    adopted: Sequence[Adopted],
+    how: Fitting,
+    start: Sequence[Array] | None = None,
+    lines: Sequence[float] = (),
+    keep: NDArray[np.bool_] | None = None,
+) -> State:
+    """Fit C, o and every coefficient together.
+
+    C and o are solved in closed form for given coefficients; the coefficients then move by a Newton step in which
+    C and o are free (their tangent space projected off), until both rest.
+
+    Parameters
+    ----------
+    start: coefficients of each model to begin with; zero if None.
+    keep: (N,) samples to believe; judged anew if None.
+    """
+    theta = [np.zeros(0)] * len(adopted) if start is None else [np.array(t) for t in start]
+    raw, reference = record.raw, record.total_field
+    estimate: Estimate | None = None
+    terms: Terms | None = None
+    for round_ in range(_MOST_ROUNDS):
+        fit = _fit(raw, reference, how, keep)
+        x = excitation_of(record, fit, lines)
+        if not adopted:
+            break
+        each = [a.terms(x) for a in adopted]
+        if round_ == 0:
+            theta = [t if len(t) == e.count else np.zeros(e.count) for t, e in zip(theta, each, strict=True)]
+            if any(t.any() for t in theta):
+                raw, reference = without(record, each, theta)
+                fit = _fit(raw, reference, how, keep)
+                x = excitation_of(record, fit, lines)
+                each = [a.terms(x) for a in adopted]
+        residual = residual_of(fit, raw, reference, how.reference_noise)
+        terms = joined(each).at(residual.samples)
+        estimate = estimated(residual, terms, colours_of(residual))
+        edges = np.cumsum([e.count for e in each])[:-1]
+        theta = [t + s for t, s in zip(theta, np.split(estimate.theta, edges), strict=True)]
+        raw, reference = without(record, each, theta)
+        step = np.abs(estimate.theta) / np.sqrt(np.maximum(np.diag(estimate.covariance), 1e-300))
+        if np.max(step, initial=0.0) < _SETTLED:
+            fit = _fit(raw, reference, how, keep)
+            x = excitation_of(record, fit, lines)
+            break
+    residual = residual_of(fit, raw, reference, how.reference_noise)
+    if adopted:
+        terms = joined([a.terms(x) for a in adopted]).at(residual.samples)
+    return State(tuple(adopted), tuple(theta), fit, residual, x, terms, colours_of(residual), estimate, tuple(lines))
+
+
+def _fit(raw: Array, reference: Array | None, how: Fitting, keep: NDArray[np.bool_] | None) -> JointFit:
+    assert reference is not None
+    return fit_joint(
+        raw, reference, noise=how.noise, reference_noise=how.reference_noise, worst_error=how.worst_error, keep=keep
+    )
+
+
+def without(record: Record, each: Sequence[Terms], theta: Sequence[Array]) -> tuple[Array, Array | None]:
+    """Raw outputs and total field with the terms' contributions taken off."""
+    raw, reference = record.raw, record.total_field
+    for terms, coefficients in zip(each, theta, strict=True):
+        raw = raw - terms.contribution(coefficients, raw.shape[1] * 3).reshape(raw.shape)
+        if reference is not None:
+            reference = reference - terms.on_reference(coefficients)
+    return raw, reference
+
+
+def excitation_of(record: Record, fit: JointFit, lines: Sequence[float] = ()) -> Excitation:
+    """Modelled outputs and field of every sample from the common field of a fit."""
+    q = nearest_frame(fit.forward)
+    b = (fit.plane.coordinates(record.raw) - fit.scalar.offset) @ fit.scalar.matrix.T
+    output = np.einsum("sij,nj->nsi", fit.forward, b) + fit.offset
+    common = np.repeat((b @ q)[:, None], len(record.sensors), axis=1)
+    return record.excitation(output, common, lines)
+
+
+Progress = Callable[[str], None]

@@ -1,0 +1,125 @@
+"""The search as `verdict.json` tells it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from magtensor.loop.assessment import Colours, block_count
+from magtensor.loop.colour import Colour
+from magtensor.loop.evidence import grams
+from magtensor.loop.model import Record, State
+from magtensor.loop.search import Candidate, Search, put_back
+from magtensor.loop.statistics import held_out_gain
+from magtensor.loop.terms import joined
+
+WHITE = Colours(Colour(None, 1.0), Colour(None, 1.0))
+
+
+def described(found: Search, record: Record, declared: int) -> dict[str, Any]:
+    """`adopted`, `rejected` and `not_tested` of the contract.
+
+    Args:
+        found: the search.
+        record: its samples.
+        declared: how many of the error models were declared and are no discovery.
+    """
+    return {
+        "adopted": [_adopted(found, i) for i in range(declared, len(found.last.adopted))],
+        "rejected": _rejected(found),
+        "not_tested": [
+            {"error_model": name, "missing": list(missing)} for name, missing in sorted(found.not_tested.items())
+        ],
+    }
+
+
+def _step_of(found: Search, name: str, settings: Any) -> Candidate | None:
+    for step in found.steps:
+        if step.adopted is not None and step.adopted.model.name == name and step.adopted.model.settings == settings:
+            return step.adopted
+    return None
+
+
+def _adopted(found: Search, index: int) -> dict[str, Any]:
+    state = found.last
+    model = state.adopted[index]
+    edges = np.cumsum([0, *(len(t) for t in state.theta)])
+    part = slice(int(edges[index]), int(edges[index + 1]))
+    assert state.terms is not None and state.estimate is not None
+    std = np.sqrt(np.maximum(np.diag(state.estimate.covariance), 0.0))[part]
+    names, sensors = state.terms.names[part], state.terms.sensors[part]
+    units = state.terms.units[part]
+    before, after = removal(state, index)
+    step = _step_of(found, model.name, model.settings)
+    rivals = next(
+        (list(s.rivals) for s in found.steps if s.adopted is not None and s.adopted is step), []
+    )
+    p = step.assessment.p if step is not None else float("nan")
+    return {
+        "error_model": model.name,
+        "kind": model.component.effect,
+        "sensors": [s for s in state.excitation.sensors if s in set(sensors)],
+        "settings": {k: _plain(v) for k, v in model.settings.items()},
+        "coefficients": [
+            {"name": n, "sensor": s, "value": float(v), "std": float(d), "units": u}
+            for n, s, v, d, u in zip(names, sensors, state.theta[index], std, units, strict=True)
+        ],
+        "evidence": {"held_out_rms_before_nT": before, "held_out_rms_after_nT": after, "z": z_of(p), "p": p},
+        "indistinguishable_from": rivals,
+    }
+
+
+def _plain(value: Any) -> Any:
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def z_of(p: float) -> float | None:
+    """The normal deviate with that two-sided probability."""
+    from scipy.stats import norm
+
+    return float(norm.isf(max(p, 1e-300) / 2.0)) if np.isfinite(p) else None
+
+
+def removal(state: State, index: int) -> tuple[float, float]:
+    """Held-out rms of the residual in nT without and with one of the adopted models, the others in both."""
+    assert state.terms is not None
+    residual = state.residual
+    theta = np.concatenate(state.theta)
+    edges = np.cumsum([0, *(len(t) for t in state.theta)])
+    own = np.zeros(len(theta), dtype=bool)
+    own[edges[index] : edges[index + 1]] = True
+    back = put_back(residual, state.terms, theta)
+    blocks = grams(back, joined([state.terms]), WHITE.across, WHITE.along, block_count(len(residual.affine)))
+    before, after = held_out_gain(blocks, residual.freedom, ~own).rms
+    return before * residual.scale, after * residual.scale
+
+
+def _rejected(found: Search) -> list[dict[str, Any]]:
+    """Every model looked at closely and not adopted, as it stood in the last round that looked at it."""
+    adopted = {a.name for a in found.last.adopted}
+    last: dict[str, str] = {}
+    for number, step in enumerate(found.steps, 1):
+        for candidate in step.candidates:
+            if step.adopted is None or candidate is not step.adopted:
+                last[candidate.model.name] = f"round {number}: {why(candidate, step.adopted)}"
+        for name in step.dropped:
+            last[name] = f"round {number}: dropped, no longer significant beside the others"
+    for name, reason in found.failed.items():
+        last.setdefault(name, f"could not be tried: {reason}")
+    return [{"error_model": n, "why": w} for n, w in sorted(last.items()) if n not in adopted]
+
+
+def why(candidate: Candidate, winner: Candidate | None) -> str:
+    """Why a candidate was not adopted in its round."""
+    gain = candidate.assessment.gain
+    figures = f"p {candidate.adjusted_p:.2g} after correction, held-out gain {gain.total:.4g} (t {gain.t:.2g})"
+    if candidate.adjusted_p >= candidate.alpha:
+        return f"not significant: {figures}"
+    if not candidate.passes:
+        return f"does not predict held-out blocks: {figures}"
+    if winner is not None:
+        ahead = winner.assessment.gain.total
+        return f"{winner.model.name} explained more (held-out gain {ahead:.4g}): {figures}"
+    return figures
+

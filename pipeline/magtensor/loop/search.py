@@ -1,0 +1,456 @@
+"""The search: screen every error model, adopt what the data want on blocks the fit has not seen, refit, repeat.
+
+An effect is adopted only when it passes two independent gates: a jackknife over blocks that autocorrelation cannot
+fool, with the family-wise error held by Holm's rule over every model and every setting tried, and a gain on held-out
+contiguous folds. Rivals that do as well on this survey are named, and the simplest of them is adopted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from magtensor.calibration.types import Array
+from magtensor.components import Component
+from magtensor.loop.assessment import Assessment, Colours, assess, estimated, explained
+from magtensor.loop.colour import Colour
+from magtensor.loop.excitation import Excitation
+from magtensor.loop.model import Adopted, Fitting, Record, State, joint_state
+from magtensor.loop.residual import Residual
+from magtensor.loop.settings import Range
+from magtensor.loop.statistics import Gain, family_p, held_out_gain
+from magtensor.loop.terms import Terms, joined
+
+ALPHA = 0.005  # family-wise probability that a clean survey gets an adoption, before the second gate
+LEAST_REDUCTION = 1e-4  # of the held-out sum of squares: smaller is significant only in very long surveys
+SEPARATION = 9.0  # twice the log likelihood ratio between two models below which the data do not tell them apart
+KEEP_ALPHA = 0.01  # an adopted effect that is no longer significant at this level is dropped
+SCREENED = 8  # models looked at closely in each step
+SCREENING_SAMPLES = 20000
+MOST_EFFECTS = 8
+_REFINEMENTS = 8
+
+WHITE = Colours(Colour(None, 1.0), Colour(None, 1.0))
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """An error model with settings, looked at closely.
+
+    Attributes:
+        model: component and settings.
+        tried: settings tried for it, for the correction of its p value.
+        terms: at the residual's samples.
+        assessment: of the terms, given the models adopted before.
+        adjusted_p: after the correction for settings and for the number of models.
+        alpha: what the adjusted p has to stay below.
+    """
+
+    model: Adopted
+    tried: int
+    terms: Terms
+    assessment: Assessment
+    adjusted_p: float
+    alpha: float = ALPHA
+
+    @property
+    def passes(self) -> bool:
+        """Both gates."""
+        gain = self.assessment.gain
+        reduction = gain.total / max(float(gain.before.sum()), 1e-300)
+        return self.adjusted_p < self.alpha and gain.consistent and reduction > LEAST_REDUCTION
+
+
+@dataclass(frozen=True)
+class Step:
+    """One round of the search: what was looked at and what was done.
+
+    Attributes:
+        before: state before; candidates: by held-out gain, best first.
+        adopted: the candidate adopted, None in the last round.
+        rivals: names of models that the data do not separate from it.
+        dropped: models dropped after the refit.
+    """
+
+    before: State
+    candidates: tuple[Candidate, ...]
+    adopted: Candidate | None
+    rivals: tuple[str, ...] = ()
+    dropped: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Search:
+    """The whole search.
+
+    Attributes:
+        first, last: states with the declared model and with all that was adopted.
+        steps: in order.
+        not_tested: model -> what the survey lacks for it.
+        failed: model -> why its regressors could not be made.
+    """
+
+    first: State
+    last: State
+    steps: tuple[Step, ...]
+    not_tested: Mapping[str, tuple[str, ...]]
+    failed: Mapping[str, str] = field(default_factory=dict)
+
+
+def search(
+    record: Record,
+    models: Sequence[Component],
+    how: Fitting,
+    *,
+    declared: Sequence[Adopted] = (),
+    most_effects: int = MOST_EFFECTS,
+    alpha: float = ALPHA,
+    say: Callable[[str], None] | None = None,
+) -> Search:
+    """Find the effects that the declared model lacks.
+
+    Parameters
+    ----------
+    record: the samples.
+    models: the error models that may be adopted.
+    how: how the joint fit is made.
+    declared: error models that are in the fit from the beginning, never dropped.
+    most_effects: stop after so many adoptions.
+    alpha: family-wise false-alarm probability of the first gate.
+    say: called with a line about each round.
+    """
+    testable, not_tested = _testable(record, models)
+    state = first = joint_state(record, declared, how)
+    steps: list[Step] = []
+    failed: dict[str, str] = {}
+    for _ in range(most_effects):
+        taken = {a.name for a in state.adopted}
+        open_ = [m for m in testable if m.name not in taken or _repeatable(m)]
+        candidates = _candidates(record, state, open_, failed, alpha)
+        passing = [c for c in candidates if c.passes]
+        if not passing:
+            steps.append(Step(state, tuple(candidates), None))
+            break
+        best = max(passing, key=lambda c: c.assessment.gain.total)
+        chosen, rivals = _simplest(best, candidates, state)
+        if say is not None:
+            say(f"adopting {chosen.model.name}")
+        after = _adopt(record, state, chosen, how)
+        after, dropped = _eliminate(record, after, how, len(declared))
+        steps.append(Step(state, tuple(candidates), chosen, rivals, dropped))
+        if chosen.model.name in dropped and len(after.adopted) <= len(state.adopted):
+            break
+        state = after
+    return Search(first, state, tuple(steps), not_tested, failed)
+
+
+def _testable(record: Record, models: Sequence[Component]) -> tuple[list[Component], dict[str, tuple[str, ...]]]:
+    """The models whose channels exist, and what the others miss."""
+    from fnmatch import fnmatchcase
+
+    have = set(record.logged) | {"time"}
+    if record.attitude is not None:
+        have.add("attitude")
+    if record.position is not None:
+        have.add("position")
+    if record.total_field is not None:
+        have.add("total_field")
+    lengths = np.bincount(record.run)
+    if np.median(lengths[record.run]) >= 5:
+        have.add("rotation")
+    found, missing = [], {}
+    for model in models:
+        lacks = tuple(
+            need
+            for need in model.declared({}).needs
+            if not any(any(fnmatchcase(h, one) for one in need.split("|")) for h in have)
+        )
+        if lacks:
+            missing[model.name] = lacks
+        else:
+            found.append(model)
+    return found, missing
+
+
+def _repeatable(model: Component) -> bool:
+    """A model that can be adopted more than once, with other settings: one that chooses a channel, time or line."""
+    from magtensor.loop.settings import AnyChannel, EventTimes, Frequencies
+
+    return any(isinstance(g, (AnyChannel, EventTimes, Frequencies)) for g in profiled(model).values())
+
+
+def profiled(model: Component) -> dict[str, Any]:
+    """The settings of a model that are searched over, with their grids."""
+    found = {}
+    for name, parameter in model.parameters.items():
+        for mark in getattr(parameter.annotation, "__metadata__", ()):
+            if hasattr(mark, "values") and callable(mark.values):
+                found[name] = mark
+    return found
+
+
+def settings_grid(model: Component, x: Excitation) -> list[dict[str, Any]]:
+    """Every combination of the grids of a model's settings."""
+    grids = {name: mark.values(x) for name, mark in profiled(model).items()}
+    combinations: list[dict[str, Any]] = [{}]
+    for name, values in grids.items():
+        combinations = [{**c, name: v} for c in combinations for v in values]
+    return combinations
+
+
+def _candidates(
+    record: Record, state: State, models: Sequence[Component], failed: dict[str, str], alpha: float
+) -> list[Candidate]:
+    """The most promising models with their best settings, assessed; their p values corrected for all that was tried."""
+    residual = state.residual
+    step = max(1, len(residual.affine) // SCREENING_SAMPLES)
+    thin = np.arange(0, len(residual.affine), step)
+    small = residual.smaller(thin)
+    scored: list[tuple[float, float, Component, dict[str, Any], int]] = []
+    for model in models:
+        best: tuple[float, dict[str, Any]] | None = None
+        grid = settings_grid(model, state.excitation)
+        for settings in grid:
+            if _already(state, model, settings):
+                continue
+            terms = _terms(model, settings, state.excitation, failed)
+            if terms is None or not terms.count:
+                continue
+            score = _score(small, terms.at(residual.samples[thin]), state, thin, WHITE)
+            if best is None or score > best[0]:
+                best = (score, settings)
+        if best is None:
+            continue
+        terms = _terms(model, best[1], state.excitation, failed)
+        assert terms is not None
+        coloured = _score(residual, terms.at(residual.samples), state, None, state.colours)
+        scored.append((best[0], coloured, model, best[1], len(grid)))
+    white_first = sorted(scored, key=lambda s: -s[0])[: SCREENED // 2]
+    coloured_first = sorted(scored, key=lambda s: -s[1])[: SCREENED - SCREENED // 2]
+    looked_at = list({id(s): s for s in (*white_first, *coloured_first)}.values())
+    found = []
+    for _, _, model, settings, tried in looked_at:
+        settings, refined = _refined(residual, model, settings, state, failed)
+        terms = _terms(model, settings, state.excitation, failed)
+        assert terms is not None
+        terms = terms.at(residual.samples)
+        assessment = _assess_given(residual, terms, state)
+        found.append((Adopted(model, settings), tried + refined, terms, assessment))
+    order = sorted(range(len(found)), key=lambda i: min(1.0, found[i][3].p * found[i][1]))
+    adjusted = np.ones(len(found))
+    running = 0.0
+    for rank, i in enumerate(order):  # Holm: the models not looked at closely count as less significant ones
+        running = max(running, min(1.0, found[i][3].p * found[i][1] * max(len(scored) - rank, 1)))
+        adjusted[i] = running
+    candidates = [
+        Candidate(model, tried, terms, assessment, float(p), alpha)
+        for (model, tried, terms, assessment), p in zip(found, adjusted, strict=True)
+    ]
+    return sorted(candidates, key=lambda c: -c.assessment.gain.total)
+
+
+def _already(state: State, model: Component, settings: Mapping[str, Any]) -> bool:
+    from magtensor.loop.settings import AnyChannel
+
+    channels = {n for n, g in profiled(model).items() if isinstance(g, AnyChannel)}
+    for adopted in state.adopted:
+        if adopted.name == model.name and all(adopted.settings.get(c) == settings.get(c) for c in channels) and channels:
+            return True
+    return False
+
+
+def _terms(model: Component, settings: Mapping[str, Any], x: Excitation, failed: dict[str, str]) -> Terms | None:
+    """The model's regressors; None, and why, where it cannot make them or they are not finite."""
+    try:
+        terms: Terms = model.function(x, **settings)
+    except (KeyError, ValueError) as error:
+        failed[model.name] = str(error)
+        return None
+    if not np.isfinite(terms.series).all():
+        failed[model.name] = "its regressors are not finite on this survey"
+        return None
+    return terms
+
+
+def _score(residual: Residual, terms: Terms, state: State, thin: Any, colours: Colours) -> float:
+    """What the terms explain beyond the adopted ones, less what as many random regressors would, in units of chance."""
+    together = terms
+    own = 0.0
+    if state.terms is not None:
+        held = state.terms if thin is None else state.terms.at(thin)
+        together = joined([held, terms])
+        own = explained(estimated(residual, held, colours))
+    estimate = estimated(residual, together, colours)
+    rank = max(min(estimate.rank, terms.count), 1)
+    return (explained(estimate) - own - rank) / float(np.sqrt(2.0 * rank))
+
+
+def _assess_given(residual: Residual, terms: Terms, state: State, colours: Colours | None = None) -> Assessment:
+    """Assess terms, the adopted models' coefficients being free as well."""
+    from dataclasses import replace
+
+    start = colours or state.colours
+    if state.terms is None:
+        return assess(residual, terms, start)
+    together = joined([state.terms, terms])
+    found = assess(residual, together, start, significance=False)
+    own = np.arange(state.terms.count, together.count)
+    blocked = np.zeros(together.count, dtype=bool)
+    blocked[: state.terms.count] = True
+    return replace(
+        found, p=family_p(found.grams, together.sensors, own.tolist()), gain=held_out_gain(found.grams, residual.freedom, blocked)
+    )
+
+
+def _refined(
+    residual: Residual, model: Component, settings: dict[str, Any], state: State, failed: dict[str, str]
+) -> tuple[dict[str, Any], int]:
+    """Settings on a range, moved between the neighbours of the best grid value by golden section."""
+    tried = 0
+    for name, grid in profiled(model).items():
+        if not isinstance(grid, Range):
+            continue
+        values = sorted(grid.values(state.excitation))
+        place = int(np.argmin(np.abs(np.array(values) - settings[name])))
+        low, high = values[max(place - 1, 0)], values[min(place + 1, len(values) - 1)]
+        terms = _terms(model, settings, state.excitation, failed)
+        if terms is None or high <= low:
+            continue
+        colours = _assess_given(residual, terms.at(residual.samples), state).colours
+
+        def gain(value: float, name: str = name, colours: Colours = colours, rest: dict[str, Any] = settings) -> float:
+            found = _terms(model, {**rest, name: value}, state.excitation, failed)
+            if found is None:
+                return -np.inf
+            return _score(residual, found.at(residual.samples), state, None, colours)
+
+        best, count = _golden(gain, low, high, settings[name])
+        settings = {**settings, name: best}
+        tried += count
+    return settings, tried
+
+
+def _golden(f: Callable[[float], float], low: float, high: float, best: float) -> tuple[float, int]:
+    ratio = (np.sqrt(5.0) - 1) / 2
+    a, b = low, high
+    c, d = b - ratio * (b - a), a + ratio * (b - a)
+    fc, fd, known = f(c), f(d), f(best)
+    for _ in range(_REFINEMENTS):
+        if fc > fd:
+            b, d, fd = d, c, fc
+            c = b - ratio * (b - a)
+            fc = f(c)
+        else:
+            a, c, fc = c, d, fd
+            d = a + ratio * (b - a)
+            fd = f(d)
+    value, top = (c, fc) if fc > fd else (d, fd)
+    return (float(value), _REFINEMENTS) if top > known else (best, _REFINEMENTS)
+
+
+def _simplest(best: Candidate, candidates: Sequence[Candidate], state: State) -> tuple[Candidate, tuple[str, ...]]:
+    """The simplest of the models that the held-out blocks do not separate from the best, and the others' names."""
+    residual = state.residual
+    colours = best.assessment.colours
+    reference = _fold_gain(best, residual, state, colours)
+    equal: list[Candidate] = [best]
+    for other in candidates:
+        if other is best or not other.passes:
+            continue
+        gain = _fold_gain(other, residual, state, colours)
+        if reference.total - gain.total < SEPARATION:
+            equal.append(other)
+    chosen = min(equal, key=lambda c: (_generic(c.model), c.assessment.estimate.rank, -c.assessment.gain.total))
+    return chosen, tuple(sorted({c.model.name for c in equal if c is not chosen} - {chosen.model.name}))
+
+
+def _generic(model: Adopted) -> bool:
+    """A model of anything that follows a channel says less than one that names a cause."""
+    return model.name in ("channel_response", "latent_source")
+
+
+def _fold_gain(candidate: Candidate, residual: Residual, state: State, colours: Colours) -> Gain:
+    from magtensor.loop.assessment import block_count
+    from magtensor.loop.evidence import grams
+
+    terms, blocked = candidate.terms, None
+    if state.terms is not None:
+        terms = joined([state.terms, candidate.terms])
+        blocked = np.zeros(terms.count, dtype=bool)
+        blocked[: state.terms.count] = True
+    blocks = grams(residual, terms, colours.across, colours.along, block_count(len(residual.affine)))
+    return held_out_gain(blocks, residual.freedom, blocked)
+
+
+def _adopt(record: Record, state: State, chosen: Candidate, how: Fitting) -> State:
+    """Refit with the chosen model, first on all sensors, then on those that show it."""
+    start: list[Array] = [*state.theta, np.zeros(chosen.terms.count)]
+    after = joint_state(record, [*state.adopted, chosen.model], how, start)
+    sensors = _sensors_showing(after, len(state.adopted))
+    if sensors is None:
+        return after
+    narrowed = Adopted(chosen.model.component, chosen.model.settings, sensors)
+    every = chosen.terms
+    keep = [i for i, s in enumerate(every.sensors) if s in sensors or s == ""]
+    return joint_state(record, [*state.adopted, narrowed], how, [*state.theta, after.theta[-1][keep]])
+
+
+def _slices(state: State) -> list[slice]:
+    edges = np.cumsum([0, *(len(t) for t in state.theta)])
+    return [slice(int(a), int(b)) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+
+
+def _significance(state: State, chosen: Sequence[int]) -> float:
+    """P value of some of the adopted coefficients, the others free: of the residual with their part put back."""
+    from magtensor.loop.assessment import block_count
+    from magtensor.loop.evidence import grams
+
+    assert state.terms is not None
+    back = put_back(state.residual, state.terms, np.concatenate(state.theta))
+    blocks = grams(
+        back, state.terms, state.colours.across, state.colours.along, block_count(len(state.residual.affine))
+    )
+    return family_p(blocks, state.terms.sensors, list(chosen))
+
+
+def put_back(residual: Residual, terms: Terms, theta: Array) -> Residual:
+    """The residual as it would be without the correction, to first order."""
+    from magtensor.loop.residual import taken_off
+
+    return taken_off(residual, terms, -theta)
+
+
+def _sensors_showing(state: State, which: int) -> tuple[str, ...] | None:
+    """Sensors whose own coefficients are significant; None where all are, or the model is not of single sensors."""
+    part = _slices(state)[which]
+    assert state.terms is not None
+    owners = state.terms.sensors[part]
+    names = [s for s in state.excitation.sensors if s in owners]
+    if len(names) < 2:
+        return None
+    showing = [
+        s
+        for s in names
+        if _significance(state, [part.start + i for i, o in enumerate(owners) if o == s]) < KEEP_ALPHA / len(names)
+    ]
+    return tuple(showing) if showing and len(showing) < len(names) else None
+
+
+def _eliminate(record: Record, state: State, how: Fitting, fixed: int) -> tuple[State, tuple[str, ...]]:
+    """Drop models that no longer earn their place, the weakest first."""
+    dropped: list[str] = []
+    while len(state.adopted) > max(fixed, 1):
+        values = [
+            _significance(state, range(part.start, part.stop)) if i >= fixed else 0.0
+            for i, part in enumerate(_slices(state))
+        ]
+        weakest = int(np.argmax(values))
+        if values[weakest] < KEEP_ALPHA:
+            break
+        dropped.append(state.adopted[weakest].name)
+        rest = [i for i in range(len(state.adopted)) if i != weakest]
+        state = joint_state(record, [state.adopted[i] for i in rest], how, [state.theta[i] for i in rest])
+    return state, tuple(dropped)

@@ -1,0 +1,82 @@
+"""The stage that closes the loop: fit, look at what is left, trace it to an effect, add it, fit again."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+from pydantic import Field
+
+from magtensor import ErrorModelsChoice, NotEnoughData, stage
+from magtensor.survey.flags import flag_ranges
+from magtensor_stages.sensors import COMMON, common_frame
+
+if TYPE_CHECKING:
+    from magtensor.survey.model import Survey
+
+
+@stage(
+    needs=("b_raw", "total_field"),
+    uses=("*", "reference/time", "reference/total_field"),
+    gives=(*COMMON, "loop/verdict"),
+    may_give=("residual/contrast", "good", "declared/matrix", "declared/offset"),
+)
+def close_loop(
+    survey: Survey,
+    *,
+    declared: ErrorModelsChoice = (),
+    search: ErrorModelsChoice = None,
+    false_alarm: Annotated[
+        float, Field(gt=0, lt=1, description="probability that a survey without any effect passes the first gate")
+    ] = 0.005,
+    most_effects: Annotated[int, Field(ge=0, description="stop after so many adoptions")] = 8,
+    reference_noise_nT: Annotated[float, Field(ge=0, description="white noise of the total field, nT")] = 0.0,
+    worst_error: Annotated[
+        float, Field(gt=0, le=1, description="refuse a fit whose predicted error of |b| reaches this fraction of F")
+    ] = 0.05,
+) -> dict[str, Any]:
+    """Calibrate all sensors jointly, find the effects that the declared model lacks, and refit with them.
+
+    `declared` names error models that are in the model from the beginning (with settings, or none); `search` those
+    that may be adopted, all that are installed if left out.
+    """
+    from magtensor.calibration.joint import calibrated
+    from magtensor.loop.errors_before_after import held_out_error
+    from magtensor.loop.model import Adopted, Fitting, without
+    from magtensor.loop.outcome import described
+    from magtensor.loop.record import record_of
+    from magtensor.loop.search import search as find
+    from magtensor.loop.stored import cleaned, effect_variables
+
+    record = record_of(survey)
+    if len(record.time) < 2:
+        raise NotEnoughData("no samples are left in use", where=str(survey.attributes.get("source", "")))
+    how = Fitting(reference_noise_nT, worst_error)
+    begin = [Adopted(component, settings) for component, settings in dict(declared or {}).values()]
+    names = {a.name for a in begin}
+    models = [component for name, (component, _) in dict(search or {}).items() if name not in names]
+    found = find(record, models, how, declared=begin, most_effects=most_effects, alpha=false_alarm)
+    first, last = found.first, found.last
+    raw, field = without(record, [a.terms(last.excitation) for a in last.adopted], last.theta)
+    calibration = calibrated(last.fit, field, raw, reference_noise_nT)
+    outcome = {"declared": ["linear", *(a.name for a in begin)]} | described(found, record, len(begin))
+    before = held_out_error(record, begin, how)
+    after = before if len(last.adopted) == len(begin) else held_out_error(record, last.adopted, how)
+    outcome["held_out"] = {"before": before, "after": after}
+    clean = cleaned(survey, calibration, last.adopted, last.theta, record.means)
+    given = common_frame(clean, calibration, "joint") | effect_variables(last.adopted, last.theta, record.means)
+    before_fit = np.linalg.norm(survey.values("b_raw"), axis=2) - survey.values("total_field")[:, None]
+    given["residual/total_field_before"] = (("time", "sensor"), before_fit, {"units": "nT", "long_name": "|b_raw| - F"})
+    alone = calibrated(first.fit, record.total_field, record.raw, reference_noise_nT)
+    given["declared/matrix"] = (("sensor", "axis", "raw_axis"), alone.matrix, {})
+    given["declared/offset"] = (("sensor", "raw_axis"), alone.offset, {"units": "nT"})
+    given["loop/verdict"] = ((), json.dumps(outcome, default=float), {})
+    if not last.fit.keep.all():
+        doubted = np.zeros(len(survey.time), dtype=bool)
+        doubted[record.samples[~last.fit.keep]] = True
+        given["good"] = (("time", "sensor"), survey.good_by_sensor & ~doubted[:, None], {"long_name": "may be used"})
+        given["flags"] = flag_ranges(
+            survey.time, doubted, by="close_loop", reason="no calibration and no noise explain it"
+        )
+    return given
