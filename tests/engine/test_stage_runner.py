@@ -103,7 +103,7 @@ def test_a_stage_within_its_declaration(own, act):
 
 @pytest.mark.parametrize("act", ["in place", "in place through xarray"])
 def test_a_stage_cannot_change_the_survey_in_place(own, act):
-    with pytest.raises(ValueError, match="read-only|destination is a view"):
+    with pytest.raises(ValueError, match=r"read-only|destination is a view"):
         running(own, f"  - start\n  - plain: {{act: {act}}}\n")
 
 
