@@ -9,7 +9,7 @@ import pytest
 
 from magtensor.report.clock import clock, instant
 from magtensor.report.drawing import label
-from magtensor.report.tables import compact, count, number, pretty, with_std
+from magtensor.report.tables import compact, count, named, number, pretty, with_std
 
 
 @pytest.mark.parametrize(
@@ -38,6 +38,7 @@ def test_with_std(value: float, std: float, text: str) -> None:
 def test_units_and_counts_as_one_writes_them() -> None:
     assert [pretty(u) for u in ("nT2/m2", "nT/m", "deg", "1", "degC", "")] == ["nT²/m²", "nT/m", "°", "", "°C", ""]
     assert count(1234567) == "1\u202f234\u202f567"
+    assert named("contrast_rms_S2_nT") == ("contrast rms S2", "nT") and named("fit_rms") == ("fit rms", "")
     assert compact({"a": [1, 2.5], "b": None, "c": {"d": "e"}}) == "a: 1, 2.5, b: , c: d: e"
 
 

@@ -219,7 +219,7 @@ def parameters(content: Content) -> list[Table]:
             if unit == "rad":
                 rows.append(Row(entry, "°", _cells(np.degrees(column), np.degrees(deviation))))
             rows.append(Row("" if unit == "rad" else entry, pretty(unit), _cells(column, deviation)))
-        title = str(dataset[name].attrs.get("long_name", name.replace("_", " ")))
+        title = str(dataset[name].attrs.get("long_name", f"parameters of {name.replace('_', ' ')}"))
         tables.append(Table(content.sensors, [("", rows)], title=title))
     return tables
 
@@ -264,13 +264,23 @@ def per_sensor(content: Content) -> Table | None:
         for name in sorted(str(v) for v in dataset.data_vars):
             values = content.variable(f"calibration/{name}") if dataset[name].dims == ("sensor",) else None
             if values is not None:
-                title = str(dataset[name].attrs.get("long_name", name.replace("_", " ")))
-                units = pretty(str(dataset[name].attrs.get("units", "")))
-                rows.append(Row(title, units, [number(v) for v in values]))
+                title, units = named(name)
+                if "units" in dataset[name].attrs:
+                    title = str(dataset[name].attrs.get("long_name", title))
+                    units = str(dataset[name].attrs["units"])
+                rows.append(Row(title, pretty(units), [number(v) for v in values]))
     noise = content.noise_of_axes
     if np.isfinite(noise).any():
         rows += [Row(f"noise of axis {a}", "nT", [number(v) for v in noise[:, k]]) for k, a in enumerate("xyz")]
     return Table(content.sensors, [("", rows)]) if rows else None
+
+
+def named(key: str) -> tuple[str, str]:
+    """`("contrast rms S2", "nT")` of `contrast_rms_S2_nT`: methods put the units of a figure at the end of its name."""
+    head, _, tail = key.rpartition("_")
+    if head and tail in ("nT", "m", "deg", "rad", "s"):
+        return head.replace("_", " "), tail
+    return key.replace("_", " "), ""
 
 
 @dataclass(frozen=True)
@@ -345,7 +355,7 @@ def diagnostics(content: Content) -> list[tuple[str, str]]:
     """Further figures of the calibration and how the tensor was assembled."""
     found = content.listed("calibration/matrix", "diagnostics")
     shown = [
-        (str(k).replace("_", " "), number(v, 5) if isinstance(v, (int, float)) else str(v))
+        (named(str(k))[0], f"{number(v, 5)} {named(str(k))[1]}".rstrip() if isinstance(v, (int, float)) else str(v))
         for k, v in (found.items() if isinstance(found, dict) else ())
     ]
     facts = content.attributes("calibration/matrix")
