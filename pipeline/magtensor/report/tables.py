@@ -377,7 +377,7 @@ def compact(value: Any) -> str:
     if value in (None, {}, [], ""):
         return ""
     if isinstance(value, Mapping):
-        return ", ".join(f"{k}: {compact(v)}" for k, v in value.items())
+        return ", ".join(f"{k}: {shown}" for k, v in value.items() if (shown := compact(v)))
     if isinstance(value, list):
         return ", ".join(compact(v) for v in value)
     if isinstance(value, float):
