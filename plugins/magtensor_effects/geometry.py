@@ -69,32 +69,17 @@ def finite_baseline(
 ) -> Terms:
     """The field between the sensors is not linear: half the second derivative times the square of the distance.
 
-    On a line the change of the gradient in time, over the speed, is its derivative along the line, which gives five of
-    the seven second derivatives; the two that lie across the line are taken as the smallest that Laplace's equation
-    allows. One coefficient, the inverse of the speed. An array of eight sensors measures all of it
-    (`least_squares` with `highest_order`).
+    On a line the change of the gradient in time, over the speed, is its derivative along the line. That gives all of
+    the bend for sensors before and behind the centre, and for those beside it the component along the line; their other
+    components depend on two second derivatives across the line that no single pass shows, and are left out. Small
+    swings of the attitude are taken as changes of the gradient. One coefficient, the inverse of the speed. An array of
+    eight sensors measures all of it (`least_squares` with `highest_order`).
     """
     place = _positions(x) - _positions(x).mean(axis=0)
-    rate = x.derivative(x.gradient)
-    curvature = _completed(rate, "xyz".index(travel))
-    bend = 0.5 * np.einsum("nijk,sj,sk->nsi", curvature, place, place)
+    along = x.derivative(x.gradient)
+    axis = "xyz".index(travel)
+    before, beside = place[:, axis], place * (np.arange(3) != axis)
+    bend = 0.5 * before[None, :, None] ** 2 * along[:, None, :, axis]
+    bend = bend + before[None, :, None] * np.einsum("nij,sj->nsi", along, beside)
+    bend[:, :, axis] += 0.5 * np.einsum("nij,si,sj->ns", along, beside, beside)
     return x.shared(x.sensed(bend), "s/m", "slowness")
-
-
-def _completed(along: Array, l: int) -> Array:  # noqa: E741
-    """(N, 3, 3, 3) symmetric and traceless from its slices (N, 3, 3) with one index l.
-
-    The field derivatives d_a d_b B_c are symmetric in all three indices; those without l have fixed traces and are
-    else zero in their two harmonic directions.
-    """
-    m, n = (i for i in range(3) if i != l)
-    out = np.zeros((len(along), 3, 3, 3))
-    for a in range(3):
-        for b in range(3):
-            out[:, l, a, b] = out[:, a, l, b] = out[:, a, b, l] = along[:, a, b]
-    for p, q in ((m, n), (n, m)):
-        trace = -along[:, l, p]  # of the block without l: d_p (d_m d_m + d_n d_n) = -d_p d_l d_l
-        out[:, p, p, p] = 0.75 * trace
-        for order in ((p, q, q), (q, p, q), (q, q, p)):
-            out[(slice(None), *order)] = 0.25 * trace
-    return out

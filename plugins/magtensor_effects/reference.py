@@ -30,8 +30,8 @@ def _total_field(x: Excitation) -> Array:
 def reference_scale(x: Excitation) -> Terms:
     """The variation at the base station is larger or smaller than at the site.
 
-    The total field about its mean; the coefficient is the excess at the base station. Common to all sensors, so the
-    tensor does not feel it. Rival: `scale_drift` where the variation is steady.
+    The total field about its mean; the coefficient is the part of the recorded variation that the site does not see.
+    Common to all sensors, so the tensor does not feel it. Rival: `scale_drift` where the variation is steady.
     """
     f = _total_field(x)
     return x.on_reference(0.01 * (f - f.mean()), "%", "excess")

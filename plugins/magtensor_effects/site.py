@@ -13,7 +13,7 @@ from magtensor.attitude import into_platform
 from magtensor.calibration.types import Array
 from magtensor.components import error_model
 from magtensor.loop.excitation import AXES, Excitation
-from magtensor.loop.settings import Choice, EventTimes, Range
+from magtensor.loop.settings import EventTimes, Range
 from magtensor.loop.terms import Terms, joined
 from magtensor.tensor.elements import COMPONENTS, NINE_OF_FIVE
 from magtensor.tensor.geometry import field_polynomials, term_names
@@ -64,25 +64,25 @@ def site_gradient(x: Excitation) -> Terms:
 def fixed_source(
     x: Excitation,
     *,
-    degree: Annotated[
-        int, Choice((3, 4)), Field(ge=1, le=4, description="highest degree of the harmonic potential")
-    ] = 3,
+    degree: Annotated[int, Field(ge=2, le=4, description="highest degree of the harmonic potential")] = 3,
 ) -> Terms:
     """A magnetic thing on the ground near the rig: its field about the rig's centre, as harmonic polynomials.
 
-    Degree 1 is a constant vector in the world, degree 2 a gradient (`site_gradient`), degree 3 and 4 the curvature
-    that a source within a few array sizes has. The coefficients, shared by all sensors, are the derivatives of the
-    field in the world frame; the constant vector is only visible against a vector reference. Rivals: `site_gradient`
-    for far sources, `frame_flexure`.
+    Degree 2 is a gradient (`site_gradient`), degree 3 and 4 the curvature that a source within a few array sizes has.
+    The constant vector of degree 1 is left out: it is part of the uniform field at the site. The coefficients, shared
+    by all sensors, are the derivatives of the field in the world frame. Rivals: `site_gradient` for far sources,
+    `frame_flexure`.
     """
     axes = _world_axes(x)
     places = _places(x, axes)
-    units = ("nT", "nT/m", "nT/m2", "nT/m3")
-    found = []
-    for l in range(1, degree + 1):  # noqa: E741
-        for name in term_names(l):
-            found.append(x.shared(_seen(x, axes, _harmonic(name, places)), units[l - 1], name))
-    return joined(found)
+    units = {2: "nT/m", 3: "nT/m2", 4: "nT/m3"}
+    return joined(
+        [
+            x.shared(_seen(x, axes, _harmonic(name, places)), units[each], name)
+            for each in range(2, degree + 1)
+            for name in term_names(each)
+        ]
+    )
 
 
 def _harmonic(name: str, places: Array) -> Array:
@@ -97,44 +97,45 @@ def _harmonic(name: str, places: Array) -> Array:
 
 @error_model(
     "site",
-    needs=("attitude", "position"),
     source="METHODS A3, 27; dipole on a straight track (Anderson functions)",
     typical="a car of 200 A m2: 20 nT at 10 m for some seconds",
 )
 def passing_source(
     x: Excitation,
     *,
-    time_s: Annotated[
-        float, EventTimes(120), Field(description="when it is nearest, s since the survey's start")
-    ] = 0.0,
+    time_s: Annotated[float, EventTimes(), Field(description="when it is nearest, s since the survey's start")] = 0.0,
     passage_s: Annotated[
         float,
-        Range(0.5, 60.0, count=5, spacing="log"),
+        Range(0.5, 60.0, count=4, spacing="log"),
         Field(gt=0, description="smallest distance over speed, s"),
     ] = 5.0,
-    gradient: Annotated[
-        bool, Choice((False, True)), Field(description="true: its field differs between the sensors")
+    whole: Annotated[
+        bool,
+        Field(description="true: all components and its gradient, which needs attitude; false: along the field only"),
     ] = False,
 ) -> Terms:
     """A dipole that passes on a straight track, such as a vehicle.
 
-    With u = (t - time_s) / passage_s its field is a combination of 1, u, u^2 over (1 + u^2)^(5/2) for every component
-    in the world, whatever the moment, the track and the distance; its gradient one of 1, u, u^2, u^3 over
-    (1 + u^2)^(7/2). Nine coefficients for all sensors, and twenty more with `gradient`.
+    With u = (t - time_s) / passage_s its field is a combination of 1, u, u^2 over (1 + u^2)^(5/2) in every component,
+    whatever the moment, the track and the distance; its gradient one of 1, u, u^2, u^3 over (1 + u^2)^(7/2). Of the
+    field common to all sensors only the component along the Earth's shows beside a base station: three coefficients.
+    With `whole` nine for the vector in the world and twenty for its gradient.
     """
-    axes = _world_axes(x)
     u = (x.elapsed - time_s) / passage_s
-    found = []
-    for k in range(3):
-        shape = u**k / (1 + u**2) ** 2.5
-        for i, axis in enumerate(AXES):
-            world = shape[:, None, None] * np.broadcast_to(np.eye(3)[i], x.output.shape)
-            found.append(x.shared(_seen(x, axes, world), "nT", f"{axis}{k}"))
-    if gradient:
-        places = _places(x, axes)
-        for name, element in zip(COMPONENTS, NINE_OF_FIVE.T.reshape(5, 3, 3), strict=True):
-            pattern = _seen(x, axes, places @ element)
-            for k in range(4):
-                shape = u**k / (1 + u**2) ** 3.5
-                found.append(x.shared(shape[:, None, None] * pattern, "nT/m", f"{name}{k}"))
-    return joined(found)
+    dipole = [u**k / (1 + u**2) ** 2.5 for k in range(3)]
+    if not whole:
+        along = x.sensed(x.field / np.linalg.norm(x.field, axis=2, keepdims=True))
+        return joined([x.shared(f[:, None, None] * along, "nT", f"u{k}") for k, f in enumerate(dipole)])
+    axes = _world_axes(x)
+    places = _places(x, axes)
+    patterns = [(AXES[i], "nT", np.broadcast_to(axis, x.output.shape), dipole) for i, axis in enumerate(np.eye(3))]
+    steeper = [u**k / (1 + u**2) ** 3.5 for k in range(4)]
+    for name, element in zip(COMPONENTS, NINE_OF_FIVE.T.reshape(5, 3, 3), strict=True):
+        patterns.append((name, "nT/m", places @ element, steeper))
+    return joined(
+        [
+            x.shared(f[:, None, None] * _seen(x, axes, world), units, f"{name} u{k}")
+            for name, units, world, shapes in patterns
+            for k, f in enumerate(shapes)
+        ]
+    )
