@@ -61,8 +61,10 @@ def close_loop(
     raw, field = without(record, [a.terms(last.excitation) for a in last.adopted], last.theta)
     calibration = calibrated(last.fit, field, raw, reference_noise_nT)
     outcome = {"declared": ["linear", *(a.name for a in begin)]} | described(found, record, len(begin))
-    before = held_out_error(record, begin, how)
-    after = before if len(last.adopted) == len(begin) else held_out_error(record, last.adopted, how)
+    keep = last.fit.keep
+    before = held_out_error(record, begin, how, first.theta, keep)
+    same = len(last.adopted) == len(begin)
+    after = before if same else held_out_error(record, last.adopted, how, last.theta, keep)
     outcome["held_out"] = {"before": before, "after": after}
     clean = cleaned(survey, calibration, last.adopted, last.theta, record.means)
     given = common_frame(clean, calibration, "joint") | effect_variables(last.adopted, last.theta, record.means)

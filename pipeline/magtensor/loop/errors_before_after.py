@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from magtensor.accuracy import error_block
 from magtensor.calibration.joint import nearest_frame
@@ -17,13 +18,17 @@ from magtensor.tensor.assembly import least_squares_assembly
 FOLDS = 5
 
 
-def held_out_error(record: Record, adopted: Sequence[Adopted], how: Fitting) -> dict[str, Any] | None:
+def held_out_error(
+    record: Record, adopted: Sequence[Adopted], how: Fitting, start: Sequence[Array], keep: NDArray[np.bool_]
+) -> dict[str, Any] | None:
     """Error figures over contiguous folds, each calibrated with the samples of the others.
 
     Parameters
     ----------
     record: the samples.
     adopted: the error models, with their settings; their coefficients are fitted anew for every fold.
+    start: coefficients to begin with; what they converge to does not depend on them.
+    keep: (N,) samples that a fit may believe.
 
     Returns
     -------
@@ -37,7 +42,7 @@ def held_out_error(record: Record, adopted: Sequence[Adopted], how: Fitting) -> 
         test = np.arange(edges[k], edges[k + 1])
         train = np.setdiff1d(np.arange(n), test)
         try:
-            state = joint_state(record.at(train), adopted, how)
+            state = joint_state(record.at(train), adopted, how, start, keep=keep[train])
         except NotEnoughData:
             return None
         x = excitation_of(record, state.fit)
@@ -50,7 +55,7 @@ def held_out_error(record: Record, adopted: Sequence[Adopted], how: Fitting) -> 
         b,
         reference if record.total_field is not None else None,
         tensor_of(b, record.position),
-        np.ones((n, sensors), dtype=bool),
+        np.repeat(keep[:, None], sensors, axis=1),
         list(record.sensors),
     )
 

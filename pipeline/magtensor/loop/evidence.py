@@ -120,8 +120,13 @@ def grams(residual: Residual, terms: Terms, across: Colour, along: Colour, block
 
 def _along(residual: Residual, terms: Terms) -> Array:
     """(N, P): each term's column along the field."""
-    columns = np.zeros((len(residual.affine), terms.count))
     gain = residual.gain / residual.noise
+    if terms.count == len(terms.part_term) and (terms.part_output != REFERENCE).all():  # one part each, the usual case
+        order = np.argsort(terms.part_term)
+        columns = gain[:, terms.part_output[order]]
+        columns *= terms.series[:, terms.part_series[order]]
+        return columns
+    columns = np.zeros((len(residual.affine), terms.count))
     for t, o, s in zip(terms.part_term, terms.part_output, terms.part_series, strict=True):
         weight = residual.reference_gain if o == REFERENCE else gain[:, o]
         columns[:, t] += weight * terms.series[:, s]

@@ -29,7 +29,7 @@ LEAST_REDUCTION = 1e-4  # of the held-out sum of squares: smaller is significant
 SEPARATION = 9.0  # twice the log likelihood ratio between two models below which the data do not tell them apart
 KEEP_ALPHA = 0.01  # an adopted effect that is no longer significant at this level is dropped
 SCREENED = 8  # models looked at closely in each step
-SCREENING_SAMPLES = 20000
+SCREENING_SAMPLES = 4000  # settings are profiled on so many samples
 MOST_EFFECTS = 8
 _REFINEMENTS = 8
 
@@ -208,26 +208,26 @@ def _candidates(
     residual = state.residual
     step = max(1, len(residual.affine) // SCREENING_SAMPLES)
     thin = np.arange(0, len(residual.affine), step)
-    small = residual.smaller(thin)
+    few = _Scorer(residual.smaller(thin), None if state.terms is None else state.terms.at(thin), WHITE)
+    white = _Scorer(residual, state.terms, WHITE)
+    coloured = _Scorer(residual, state.terms, state.colours)
     scored: list[tuple[float, float, Component, dict[str, Any], int]] = []
     for model in models:
+        grid = [g for g in settings_grid(model, state.excitation) if not _already(state, model, g)]
         best: tuple[float, dict[str, Any]] | None = None
-        grid = settings_grid(model, state.excitation)
         for settings in grid:
-            if _already(state, model, settings):
-                continue
             terms = _terms(model, settings, state.excitation, failed)
             if terms is None or not terms.count:
                 continue
-            score = _score(small, terms.at(residual.samples[thin]), state, thin, WHITE)
+            score = few(terms.at(residual.samples[thin])) if len(grid) > 1 else 0.0
             if best is None or score > best[0]:
                 best = (score, settings)
         if best is None:
             continue
         terms = _terms(model, best[1], state.excitation, failed)
         assert terms is not None
-        coloured = _score(residual, terms.at(residual.samples), state, None, state.colours)
-        scored.append((best[0], coloured, model, best[1], len(grid)))
+        terms = terms.at(residual.samples)
+        scored.append((white(terms), coloured(terms), model, best[1], len(grid)))
     white_first = sorted(scored, key=lambda s: -s[0])[: SCREENED // 2]
     coloured_first = sorted(scored, key=lambda s: -s[1])[: SCREENED - SCREENED // 2]
     looked_at = list({id(s): s for s in (*white_first, *coloured_first)}.values())
@@ -275,17 +275,18 @@ def _terms(model: Component, settings: Mapping[str, Any], x: Excitation, failed:
     return terms
 
 
-def _score(residual: Residual, terms: Terms, state: State, thin: Any, colours: Colours) -> float:
-    """What the terms explain beyond the adopted ones, less what as many random regressors would, in units of chance."""
-    together = terms
-    own = 0.0
-    if state.terms is not None:
-        held = state.terms if thin is None else state.terms.at(thin)
-        together = joined([held, terms])
-        own = explained(estimated(residual, held, colours))
-    estimate = estimated(residual, together, colours)
-    rank = max(min(estimate.rank, terms.count), 1)
-    return (explained(estimate) - own - rank) / float(np.sqrt(2.0 * rank))
+class _Scorer:
+    """What terms explain beyond the adopted ones, less what as many random regressors would, in units of chance."""
+
+    def __init__(self, residual: Residual, adopted: Terms | None, colours: Colours) -> None:
+        self.residual, self.adopted, self.colours = residual, adopted, colours
+        self.own = 0.0 if adopted is None else explained(estimated(residual, adopted, colours))
+
+    def __call__(self, terms: Terms) -> float:
+        together = terms if self.adopted is None else joined([self.adopted, terms])
+        estimate = estimated(self.residual, together, self.colours)
+        rank = max(min(estimate.rank, terms.count), 1)
+        return (explained(estimate) - self.own - rank) / float(np.sqrt(2.0 * rank))
 
 
 def _assess_given(residual: Residual, terms: Terms, state: State, colours: Colours | None = None) -> Assessment:
@@ -320,12 +321,11 @@ def _refined(
         if terms is None or high <= low:
             continue
         colours = _assess_given(residual, terms.at(residual.samples), state).colours
+        score = _Scorer(residual, state.terms, colours)
 
-        def gain(value: float, name: str = name, colours: Colours = colours, rest: dict[str, Any] = settings) -> float:
+        def gain(value: float, name: str = name, score: _Scorer = score, rest: dict[str, Any] = settings) -> float:
             found = _terms(model, {**rest, name: value}, state.excitation, failed)
-            if found is None:
-                return -np.inf
-            return _score(residual, found.at(residual.samples), state, None, colours)
+            return -np.inf if found is None else score(found.at(residual.samples))
 
         best, count = _golden(gain, low, high, settings[name])
         settings = {**settings, name: best}
