@@ -158,19 +158,24 @@ def apply_to(calibration: Survey, path: Path, planned: Plan, *, tolerant: bool =
     """Another survey, loaded as the recipe loads and corrected with a calibration; `tolerant` as in `load_as`."""
     from magtensor.calibrated import corrected, require_sensors, restored
     from magtensor.loop.stored import cleaned, stored_effects
-    from magtensor.tensors import assembled, stored_assembly, stored_refinement
+    from magtensor.tensor.elements import five
+    from magtensor.tensors import assembled, refined, refinement_noise, stored_assembly, stored_refinement
 
     survey = load_as(planned, path, tolerant=tolerant)
-    require_sensors(survey, result.sensors_of(calibration), str(path))
-    fitted = restored(calibration)
-    survey = cleaned(survey, fitted, *stored_effects(calibration, planned.registry))
-    survey = survey.merged(corrected(fitted, survey))
-    if "calibration/tensor_gain" in calibration:
-        b, noise = survey.values("calibrated/b"), calibration.values("calibration/noise_std")
-        position = calibration.values("calibration/position")
-        survey = survey.merged(
-            assembled(stored_assembly(calibration), b, position, noise, fitted, stored_refinement(calibration))
-        )
+    refinement = stored_refinement(calibration)
+    if "calibration/matrix" in calibration:
+        require_sensors(survey, result.sensors_of(calibration), str(path))
+        fitted = restored(calibration)
+        survey = cleaned(survey, fitted, *stored_effects(calibration, planned.registry))
+        survey = survey.merged(corrected(fitted, survey))
+        if "calibration/tensor_gain" in calibration:
+            b, noise = survey.values("calibrated/b"), calibration.values("calibration/noise_std")
+            position = calibration.values("calibration/position")
+            assembly = stored_assembly(calibration)
+            survey = survey.merged(assembled(assembly, b, position, noise, fitted, refinement))
+    elif refinement is not None:
+        measured = five(survey.values("calibrated/tensor"))
+        survey = survey.merged(refined(measured, refinement_noise(calibration), refinement))
     return survey
 
 
