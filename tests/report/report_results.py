@@ -56,7 +56,7 @@ def tumbling(samples: int, rng: np.random.Generator) -> np.ndarray:
 
 
 def calibrated_survey(
-    samples: int = 3000, sensors: tuple[str, ...] = ("S1", "S2", "S3", "S4"), *, seed: int = 7, effect_nT: float = 0.0
+    samples: int = 900, sensors: tuple[str, ...] = ("S1", "S2", "S3", "S4"), *, seed: int = 7, effect_nT: float = 0.0
 ) -> Survey:
     """A survey as it is after the last stage: true fields with noise, known responses, a total field, QC, flags.
 
