@@ -20,7 +20,7 @@ def verdict(survey: Survey, verify: dict[str, Any] | None = None) -> dict[str, A
     """
     found: dict[str, Any] = {
         "schema": SCHEMA,
-        "declared": ["linear"] if "calibration/matrix" in survey else [],
+        "declared": ["linear"] if {"calibration/matrix", "calibration/tensor_matrix"} & set(survey) else [],
         "noise_floor_nT": noise_floor(survey),
         "adopted": [],
         "rejected": [],
@@ -70,7 +70,8 @@ def sentence(outcome: dict[str, Any]) -> str:
     """The verdict in one sentence."""
     where, before, after = _judged(outcome)
     if after is None:
-        return "Nothing was calibrated."
+        refined = "The tensor was refined; its error cannot be told without a tensor that is known."
+        return refined if outcome["declared"] else "Nothing was calibrated."
     figures = [
         f"{name} {_change(before, after, key)} {unit} rms"
         for name, key, unit in (
