@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import pickle
 from collections.abc import Callable, Mapping
+from difflib import get_close_matches
 from itertools import product
 from typing import Any
 
@@ -47,10 +48,7 @@ def check_error_model(candidate: Component | Callable[..., Terms]) -> list[str]:
         return [str(error)]
     problems = _documentation(component) + _settings(component) + _pickling(component)
     for title, survey in _surveys(component).items():
-        lacks = missing(component, survey)
-        if lacks:
-            if title == "tumbling":
-                problems.append(f"needs: {', '.join(lacks)} is neither a channel nor one of {', '.join(FACTS)}")
+        if missing(component, survey):
             continue
         for settings in _combinations(component, survey):
             found = _regressors(component, survey, settings, dense=title == "tumbling")
@@ -86,6 +84,11 @@ def _documentation(component: Component) -> list[str]:
         found.append("no typical magnitude: @error_model(..., typical=) says what to expect")
     if component.effect not in ("instrument", "site", "reference"):
         found.append(f"its kind is {component.effect!r}; instrument, site or reference would be right")
+    for need in component.declared({}).needs:
+        for word in need.split("|"):
+            near = [] if word in FACTS else get_close_matches(word, FACTS, n=1, cutoff=0.8)
+            if near:
+                found.append(f"needs {word!r}, which is taken for the name of a channel (did you mean {near[0]}?)")
     return found
 
 

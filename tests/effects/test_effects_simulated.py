@@ -1,0 +1,390 @@
+"""Every error model against the effect of its name as the simulator produces it in the time domain.
+
+The share that is left is of the effect's rms once C and o of each sensor have explained what they can. Where no other
+reason is given, what is left comes from the logger's noise in the channels and from offsets that the simulator's
+scale effects do not multiply (100 nT in 50 000).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from effect_cases import (
+    LINES,
+    POSTURES,
+    TUMBLING,
+    Array,
+    Explained,
+    excitation,
+    explained,
+    explained_on_reference,
+    per_axis,
+    per_matrix,
+    simulated,
+)
+
+import magtensor_effects
+from magtensor.components import Component, component_of
+from magtensor.loop.excitation import Excitation
+from magtensor.simulate.run import Simulated
+
+SPAN_S = 179.9  # of the tumbling survey
+START_S = 1.0  # the simulator begins at rest: rates are not the steady motion's before
+
+
+def drawn(scale: float, seed: int = 5) -> list[list[float]]:
+    """Coefficients for four sensors."""
+    return (scale * np.random.default_rng(seed).standard_normal((4, 3))).tolist()
+
+
+def model(name: str) -> Component:
+    found = component_of(getattr(magtensor_effects, name))
+    assert found is not None
+    return found
+
+
+def fitted(
+    name: str,
+    settings: dict[str, Any],
+    effect: dict[str, Any],
+    base: dict[str, Any] = TUMBLING,
+    simulated_as: str = "",
+    after_s: float = 0.0,
+) -> tuple[Explained, Simulated, Excitation]:
+    survey = simulated(simulated_as or name, base, **effect)
+    x = excitation(survey)
+    terms = model(name).function(x, **settings)
+    return explained(terms, x, survey.truth.effects[0].added, after_s=after_s), survey, x
+
+
+def truth_of(survey: Simulated) -> Array:
+    (values,) = survey.truth.effects[0].coefficients.values()
+    return np.asarray(values)
+
+
+# name, settings, effect, share left, coefficient per unit of the simulator's
+PER_AXIS: list[tuple[str, dict[str, Any], dict[str, Any], float, float]] = [
+    ("temperature_offset", {"lag_s": 40.0}, {"nT_per_degC": drawn(1), "lag_s": 40.0}, 0.01, 1.0),
+    ("temperature_offset", {}, {"nT_per_degC": drawn(1)}, 0.01, 1.0),
+    ("temperature_scale", {"lag_s": 10.0}, {"ppm_per_degC": drawn(20), "lag_s": 10.0}, 0.01, 1.0),
+    # the regressor is the difference of 0.09 degC rms between skin and core: logger's noise of 0.002 counts
+    ("temperature_rate", {"tau_s": 20.0}, {"nT_per_degC": drawn(1), "tau_s": 20.0}, 0.03, 1.0),
+    ("warm_up", {"tau_s": 50.0}, {"nT": drawn(10), "tau_s": 50.0}, 1e-6, 1.0),
+    ("offset_step", {"time_s": 77.0}, {"nT": drawn(5), "time_s": [77.0]}, 1e-6, 1.0),
+    ("supply_scale", {}, {"ppm_per_V": drawn(30)}, 0.01, 1.0),
+    ("supply_offset", {}, {"nT_per_V": drawn(30)}, 0.01, 1.0),
+    ("nonlinearity_quadratic", {}, {"nT_at_full_scale": drawn(3)}, 1e-6, 1.0),
+    ("nonlinearity_cubic", {}, {"nT_at_full_scale": drawn(3)}, 1e-6, 1.0),
+    # the simulator follows the loop in quarters of a sample interval; the coefficient is weight times half width
+    ("hysteresis", {"half_width_nT": 5000.0}, {"weight": drawn(1e-3), "half_width_nT": [5000.0]}, 0.005, 5000.0),
+    # delays of some ms: what is left is the second order, lag times rate of turn, about 1e-3
+    ("sampling_lag", {"per_axis": True}, {"lag_s": drawn(2e-3)}, 0.005, 1.0),
+    (
+        "bandwidth",
+        {"tau_s": 1e-3},
+        {"tau_s": np.abs(drawn(2e-3)).tolist()},
+        0.005,
+        1.0,
+    ),
+]
+
+
+@pytest.mark.parametrize(("name", "settings", "effect", "bound", "per_unit"), PER_AXIS)
+def test_one_coefficient_an_axis(
+    name: str, settings: dict[str, Any], effect: dict[str, Any], bound: float, per_unit: float
+) -> None:
+    fit, survey, _ = fitted(name, settings, effect, after_s=START_S)
+    assert fit.left < bound
+    true = per_unit * truth_of(survey)
+    found = per_axis(fit, survey.sensors, "lag " if name == "sampling_lag" else "")
+    np.testing.assert_allclose(found, true, atol=0.01 * np.abs(true).max())
+
+
+def test_drifts_have_the_changes_that_were_put_in() -> None:
+    fit, survey, _ = fitted("offset_drift", {"order": 1, "span_s": SPAN_S}, {"nT_per_h": drawn(100)})
+    assert fit.left < 1e-6
+    change = 2.0 * per_axis(fit, survey.sensors, "P1 ")
+    np.testing.assert_allclose(change, truth_of(survey) * SPAN_S / 3600, rtol=1e-6)
+    fit, survey, _ = fitted("scale_drift", {"order": 1, "span_s": SPAN_S}, {"ppm": drawn(1000)})
+    assert fit.left < 0.005
+    change = 2.0 * per_axis(fit, survey.sensors, "P1 ")
+    np.testing.assert_allclose(change, truth_of(survey) * SPAN_S / 3600, atol=0.01 * np.abs(change).max())
+
+
+def test_drifts_of_other_shapes_are_followed_by_their_polynomials() -> None:
+    # a quadratic is one; a logarithm over 180 s with a time constant of 100 s leaves its fourth order; a wander with
+    # knots every 100 s has nearly the four coefficients of a cubic
+    quadratic = {"nT_per_h": drawn(100), "shape": "quadratic"}
+    assert fitted("offset_drift", {"order": 2, "span_s": SPAN_S}, quadratic)[0].left < 1e-6
+    logarithm = {"ppm": drawn(100), "shape": "logarithmic", "time_s": 100.0}
+    assert fitted("scale_drift", {"order": 3, "span_s": SPAN_S}, logarithm)[0].left < 0.01
+    wander = {"nT_per_h": drawn(100), "shape": "wander", "time_s": 100.0}
+    assert fitted("offset_drift", {"order": 3, "span_s": SPAN_S}, wander)[0].left < 0.1
+
+
+def test_a_drift_stays_where_the_survey_left_it() -> None:
+    x = excitation(simulated("warm_up", nT=[1.0, 1.0, 1.0]))
+    series = magtensor_effects.offset_drift(x, order=3, span_s=90.0).series
+    np.testing.assert_array_equal(series[x.elapsed >= 90.0], 1.0)
+
+
+def test_current_field_is_the_field_as_each_axis_senses_it() -> None:
+    effect = {"nT_per_A": drawn(3), "channel": "current_pump", "lag_s": 1.0}
+    fit, survey, _ = fitted("current_field", {"lag_s": 1.0}, effect)
+    assert fit.left < 0.01
+    sensed = np.einsum("sij,sj->si", survey.truth.matrix, truth_of(survey))
+    np.testing.assert_allclose(per_axis(fit, survey.sensors), sensed, atol=0.01 * np.abs(sensed).max())
+
+
+def test_cross_field_finds_product_and_difference() -> None:
+    effect = {"nT_at_full_scale": drawn(3), "difference_ratio": 0.5}
+    fit, survey, _ = fitted("cross_field", {}, effect)
+    assert fit.left < 1e-6
+    np.testing.assert_allclose(per_axis(fit, survey.sensors, "product "), truth_of(survey), rtol=1e-6)
+    np.testing.assert_allclose(per_axis(fit, survey.sensors, "difference "), 0.5 * truth_of(survey), rtol=1e-6)
+
+
+def test_one_play_operator_takes_most_of_two() -> None:
+    # loops of 2000 and 8000 nT: one of the larger width misses the early part of each reversal
+    effect = {"weight": drawn(1e-3), "half_width_nT": [2000.0, 8000.0]}
+    assert fitted("hysteresis", {"half_width_nT": 7000.0}, effect)[0].left < 0.2
+
+
+def test_sampling_lag_of_whole_sensors_needs_one_coefficient_each() -> None:
+    lag = [[a, a, a] for a in (1e-3, -2e-3, 0.5e-3, 3e-3)]
+    fit, survey, _ = fitted("sampling_lag", {}, {"lag_s": lag})
+    assert fit.left < 0.005
+    found = [fit.coefficients["lag", s] for s in survey.sensors]
+    np.testing.assert_allclose(found, [row[0] for row in lag], atol=1e-5)
+
+
+def test_eddy_current_is_the_coupling_times_the_time_constant() -> None:
+    coupling = np.random.default_rng(3).standard_normal((4, 3, 3))
+    effect = {"coupling": coupling.tolist(), "tau_s": 1e-3}
+    fit, survey, _ = fitted("eddy_current", {}, effect, after_s=START_S)
+    assert fit.left < 0.005
+    expected = 1e-3 * survey.truth.matrix @ coupling
+    np.testing.assert_allclose(per_matrix(fit, survey.sensors), expected, atol=1e-5)
+
+
+def test_eddy_currents_contain_delays_and_filters() -> None:
+    assert fitted("eddy_current", {}, {"rms_nT": 3.0}, simulated_as="sampling_lag", after_s=START_S)[0].left < 0.005
+    assert fitted("eddy_current", {}, {"rms_nT": 3.0}, simulated_as="bandwidth", after_s=START_S)[0].left < 0.005
+
+
+def test_a_slow_filter_is_told_from_a_delay() -> None:
+    # 0.4 s at rates of 0.44 rad/s in each component: the second order is a fifth of the first
+    slow = {"tau_s": [0.4, 0.4, 0.4]}
+    right = fitted("bandwidth", {"tau_s": 0.4}, slow, after_s=5.0)[0]
+    assert right.left < 0.01
+    assert all(value == pytest.approx(0.4, rel=0.01) for value in right.coefficients.values())
+    assert fitted("bandwidth", {"tau_s": 1e-3}, slow, after_s=5.0)[0].left > 0.15
+
+
+def test_clock_drift_in_ppm() -> None:
+    fit, survey, _ = fitted("clock_drift", {}, {"ppm": [20.0, -5.0, 3.0, -9.0]})
+    assert fit.left < 0.005  # second order: a delay of up to 4 ms
+    found = [fit.coefficients["drift", s] for s in survey.sensors]
+    np.testing.assert_allclose(found, [20.0, -5.0, 3.0, -9.0], atol=0.05)
+
+
+@pytest.mark.parametrize("tau_s", [3.0, 20.0])
+def test_viscous_magnetisation_as_a_fraction_of_the_field(tau_s: float) -> None:
+    coupling = 1e-4 * np.random.default_rng(3).standard_normal((4, 3, 3))
+    effect = {"coupling": coupling.tolist(), "tau_s": tau_s}
+    fit, survey, _ = fitted("viscous_magnetisation", {"tau_s": tau_s}, effect)
+    assert fit.left < 0.005
+    expected = 1e6 * survey.truth.matrix @ coupling
+    np.testing.assert_allclose(per_matrix(fit, survey.sensors), expected, atol=0.5)
+
+
+def test_moving_part_turns_a_vector_at_each_sensor() -> None:
+    fit, _, _ = fitted("moving_part", {}, {"moment_Am2": 0.1, "position_m": [0.3, 0.2, -0.8]})
+    assert fit.left < 0.005
+
+
+def test_periodic_interference_has_the_amplitude_of_the_tone() -> None:
+    # perfect sensors, so that the tone of each axis is its own; 49.7 Hz appears as 0.3 Hz at 10 samples a second
+    base = TUMBLING | {"instrument": {"seed": 1, "array": TUMBLING["instrument"]["array"]}}
+    effect = {"amplitude_nT": drawn(3), "frequency_Hz": 49.7}
+    fit, survey, _ = fitted("periodic_interference", {"frequency_Hz": 0.3}, effect, base)
+    assert fit.left < 1e-6
+    amplitude = np.hypot(per_axis(fit, survey.sensors, "cos "), per_axis(fit, survey.sensors, "sin "))
+    np.testing.assert_allclose(amplitude, np.abs(truth_of(survey)), rtol=1e-6)
+
+
+@pytest.mark.parametrize("known_by", ["acceleration", "attitude"])
+def test_frame_flexure_in_arcmin_per_g(known_by: str) -> None:
+    bends = np.random.default_rng(4).standard_normal((4, 3, 3))
+    base = TUMBLING | {"logging": {known_by: True}}
+    fit, survey, _ = fitted("frame_flexure", {}, {"arcmin_per_g": bends.tolist()}, base)
+    assert fit.left < 0.005
+    # the simulator's g is 9.81; second order is one arcmin, 3e-4
+    np.testing.assert_allclose(per_matrix(fit, survey.sensors), bends, atol=0.01)
+
+
+@pytest.mark.parametrize(
+    ("settings", "units"),
+    [
+        ({"power": 1, "lag_s": 3.0}, "nT/hPa"),
+        ({"power": 2, "lag_s": 3.0}, "nT/(hPa)^2"),
+        ({"power": 3, "times_field": True}, "ppm/(hPa)^3"),
+    ],
+)
+def test_channel_response(settings: dict[str, Any], units: str) -> None:
+    effect = {"nT_per_unit": drawn(20 if "times_field" in settings else 2), "channel": "pressure"} | settings
+    fit, survey, x = fitted("channel_response", {"channel": "pressure"} | settings, effect)
+    assert fit.left < 0.01
+    true = truth_of(survey)
+    np.testing.assert_allclose(per_axis(fit, survey.sensors), true, atol=0.02 * np.abs(true).max())
+    assert set(magtensor_effects.channel_response(x, channel="pressure", **settings).units) == {units}
+
+
+def test_a_channel_with_three_components_reaches_every_axis() -> None:
+    survey = simulated("warm_up", nT=[1.0, 1.0, 1.0])
+    x = excitation(survey)
+    coupling = np.random.default_rng(1).standard_normal((4, 3, 3))
+    added = np.einsum("sij,nj->nsi", coupling, x.channel("acceleration"))
+    fit = explained(magtensor_effects.channel_response(x, channel="acceleration"), x, added)
+    np.testing.assert_allclose(per_matrix(fit, survey.sensors), coupling, rtol=1e-6)
+
+
+def without_common_vector(survey: Simulated, x: Excitation, added: Array) -> Array:
+    """A site effect without the constant vector in the world that belongs to the field of the site."""
+    from scipy.spatial.transform import Rotation
+
+    to_world = Rotation.from_quat(x.attitude).as_matrix()
+    world = np.einsum("nij,sjk,nsk->nsi", to_world, np.linalg.inv(survey.truth.matrix), added)
+    common = np.broadcast_to(world.mean(axis=(0, 1)), added.shape)
+    return added - np.einsum("sij,nkj,nsk->nsi", survey.truth.matrix, to_world, common)
+
+
+@pytest.mark.parametrize(("degree", "bound"), [(2, 0.3), (3, 0.06), (4, 0.01)])
+def test_fixed_source_converges_with_the_degree(degree: int, bound: float) -> None:
+    # a dipole at 2.2 m and sensors 0.25 m from the centre: each degree leaves about a tenth (0.25 / 2.2) times 1.5
+    survey = simulated("fixed_source", position_m=[2.0, 0.0, -1.0], moment_Am2=[3.0, -2.0, 4.0])
+    x = excitation(survey)
+    effect = without_common_vector(survey, x, survey.truth.effects[0].added)
+    assert explained(magtensor_effects.fixed_source(x, degree=degree), x, effect).left < bound
+
+
+def test_site_gradient_is_the_tensor_in_the_world() -> None:
+    tensor = [12.0, -5.0, 3.0, -20.0, 7.0]
+    fit, _, _ = fitted("site_gradient", {}, {"tensor_nT_per_m": tensor})
+    assert fit.left < 1e-6
+    found = [fit.coefficients[name, ""] for name in ("xx", "xy", "xz", "yy", "yz")]
+    np.testing.assert_allclose(found, tensor, rtol=1e-6)
+
+
+PASSING = {"rms_nT": 3.0, "time_s": 80.0, "closest_m": [8.0, 0.0, 1.0], "velocity_m_s": [0.0, 3.0, 0.0]}
+PASSAGE_S = np.sqrt(65.0) / 3.0
+
+
+def test_passing_source_whole() -> None:
+    # closest distance 8.06 m at 3 m/s; what is left is the curvature over the array, (0.25 / 8)^2 times a few
+    settings = {"time_s": 80.0, "passage_s": PASSAGE_S, "whole": True}
+    assert fitted("passing_source", settings, PASSING)[0].left < 0.01
+
+
+def test_passing_source_as_the_total_field_sees_it() -> None:
+    survey = simulated("passing_source", **PASSING)
+    x = excitation(survey)
+    seen = np.einsum("sij,nsj->nsi", np.linalg.inv(survey.truth.matrix), survey.truth.effects[0].added)
+    unit = x.field / np.linalg.norm(x.field, axis=2, keepdims=True)
+    along = np.einsum("nsk,nsk->n", seen, unit) / 4
+    terms = magtensor_effects.passing_source(x, time_s=80.0, passage_s=PASSAGE_S)
+    columns = np.stack([terms.contribution(u, 12)[:, 0] / x.sensed(unit)[:, 0, 0] for u in np.eye(3)], axis=1)
+    left = along - columns @ np.linalg.lstsq(columns, along, rcond=None)[0]
+    assert np.sqrt(np.mean(left**2)) < 0.01 * np.sqrt(np.mean(along**2))
+
+
+def test_crosstalk_shows_in_a_gradient_only_and_gives_the_coil() -> None:
+    fit, survey, x = fitted("crosstalk", {}, {"coil_m3": 1e-6}, LINES)
+    assert fit.rms < 0.01 * survey.truth.effects[0].rms_nT  # the rest is inside C
+    assert fit.left < 0.001
+    assert all(value == pytest.approx(1.0, rel=1e-3) for value in fit.coefficients.values())
+    uniform = magtensor_effects.crosstalk(excitation(simulated("crosstalk", coil_m3=1e-6)))
+    assert np.abs(uniform.series).max() < 1e-12 * np.abs(x.field).max()
+
+
+def test_position_error_in_mm() -> None:
+    # sources 8 m below and sensors 0.25 m from the centre: the gradient at a sensor differs from the array's by
+    # 4 * 0.25 / 8, an eighth
+    fit, survey, _ = fitted("position_error", {}, {"offset_m": drawn(1e-3)}, LINES)
+    assert fit.left < 0.125
+    true = 1e3 * truth_of(survey)
+    np.testing.assert_allclose(per_axis(fit, survey.sensors), true, atol=0.125 * np.abs(true).max())
+
+
+def test_baseline_expansion_in_ppm_per_degC() -> None:
+    fit, _, _ = fitted("baseline_expansion", {}, {"ppm_per_degC": 500.0}, LINES)
+    assert fit.left < 0.125
+    assert fit.coefficients["expansion", ""] == pytest.approx(500.0, rel=0.05)
+
+
+def test_finite_baseline_follows_the_bend_along_the_line() -> None:
+    # a fifth sensor in the middle tells the true field there; level flight at 1 m/s, so the slowness is 1 s/m
+    places = [[0.5, 0.0, 0.0], [0.0, 0.5, 0.0], [-0.5, 0.0, 0.0], [0.0, -0.5, 0.0], [0.0, 0.0, 0.0]]
+    base = LINES | {
+        "instrument": TUMBLING["instrument"] | {"array": {"positions_m": places}},
+        "motion": LINES["motion"] | {"wobble_deg": 0.0},
+    }
+    survey = simulated("warm_up", base, nT=[1.0, 1.0, 1.0])
+    x, truth = excitation(survey), survey.truth
+    linear = truth.b[:, 4:] + np.einsum("nij,sj->nsi", truth.tensor, survey.position)
+    bend = np.einsum("sij,nsj->nsi", truth.matrix, truth.b - linear)
+    found = magtensor_effects.finite_baseline(x).contribution(np.ones(1), 15).reshape(bend.shape)
+    # left is the next order, distance over range: 0.5 / 8 times 2
+    for sensor in (0, 2):
+        assert np.linalg.norm(found[:, sensor] - bend[:, sensor]) < 0.125 * np.linalg.norm(bend[:, sensor])
+    for sensor in (1, 3):
+        assert np.linalg.norm((found - bend)[:, sensor, 0]) < 0.125 * np.linalg.norm(bend[:, sensor, 0])
+
+
+@pytest.mark.parametrize(
+    ("name", "settings", "effect", "bound", "coefficient"),
+    [
+        # of what was recorded, 1.05 times the site's, 5 / 105 is too much
+        ("reference_scale", {}, {"excess": 0.05}, 0.005, 500 / 105),
+        # of waves of some 25 s: second order in the delay 2.5 %, the slope taken over 2 s another 1 %, and readings
+        # once a second joined by straight lines
+        ("reference_clock", {}, {"offset_s": 0.2}, 0.06, 0.2),
+        ("reference_clock", {"lag_s": 8.0}, {"offset_s": 8.0}, 0.03, 8.0),
+        # a step between two readings a second apart: ten samples of 1800 are interpolated
+        ("reference_step", {"time_s": 60.0}, {"steps_nT": [3.0], "time_s": [60.0]}, 0.1, 3.0),
+    ],
+)
+def test_reference(
+    name: str, settings: dict[str, Any], effect: dict[str, Any], bound: float, coefficient: float
+) -> None:
+    survey = simulated(name, **effect)
+    x = excitation(survey)
+    assert survey.reference is not None
+    added = np.interp(survey.time, survey.reference.time, survey.truth.effects[0].added)
+    terms = model(name).function(x, **settings)
+    known = x.elapsed < x.duration - 10.0  # beyond its end the record cannot tell what a late clock should have said
+    fit = explained_on_reference(terms.at(np.flatnonzero(known)), added[known])
+    assert fit.left < bound
+    (found,) = fit.coefficients.values()
+    assert found == pytest.approx(coefficient, rel=0.02)
+
+
+def test_lags_run_on_through_gaps() -> None:
+    # 3 s at rest, 3 s of turning that is not recorded: a thermal lag of 40 s does not begin anew at each posture
+    fit, survey, _ = fitted("temperature_offset", {"lag_s": 40.0}, {"nT_per_degC": drawn(1), "lag_s": 40.0}, POSTURES)
+    assert fit.left < 0.01
+    np.testing.assert_allclose(per_axis(fit, survey.sensors), truth_of(survey), atol=0.02)
+    # of the field's way between two postures only the ends are known: a tenth of what iron remembers is missed
+    viscous = {"rms_nT": 3.0, "tau_s": 20.0}
+    assert fitted("viscous_magnetisation", {"tau_s": 20.0}, viscous, POSTURES)[0].left < 0.1
+
+
+def test_every_model_is_held_to_the_simulator_here() -> None:
+    import inspect
+    import sys
+
+    source = inspect.getsource(sys.modules[__name__])
+    tried = [n for n in magtensor_effects.__all__ if f'"{n}"' in source or f"magtensor_effects.{n}(" in source]
+    assert tried == magtensor_effects.__all__
