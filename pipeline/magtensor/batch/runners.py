@@ -28,7 +28,8 @@ class LocalRunner:
     """At most `workers` processes of this machine at once; default: one per core this process may use."""
 
     def __init__(self, workers: int | None = None) -> None:
-        self.workers = workers or len(os.sched_getaffinity(0))
+        allowed = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+        self.workers = workers or allowed or 1
 
     def run(self, tasks: Iterable[Task]) -> Generator[tuple[Task, Outcome]]:
         """As `Runner.run`."""
