@@ -25,7 +25,7 @@ def _courses(x: Excitation, order: int, span_s: float) -> list[Array]:
     return [np.polynomial.legendre.Legendre.basis(k)(u) for k in range(1, order + 1)]
 
 
-@error_model("instrument", source="METHODS A3, 6", typical="some nT/h after switch-on, fluxgate zero drift")
+@error_model("instrument", source="zero drift of fluxgates", typical="some nT/h after switch-on, fluxgate zero drift")
 def offset_drift(x: Excitation, *, order: Order = 1, span_s: Span = 3600.0) -> Terms:
     """Each axis's offset drifts with time.
 
@@ -38,7 +38,7 @@ def offset_drift(x: Excitation, *, order: Order = 1, span_s: Span = 3600.0) -> T
 
 
 @error_model(
-    "instrument", source="METHODS A3, 7", typical="-79 ppm/yr (Swarm), as the logarithm of time (CHAMP) after launch"
+    "instrument", source="Yin and Luhr 2011 (CHAMP); Olsen et al. 2003 (Oersted)", typical="-79 ppm/yr (Swarm), as the logarithm of time (CHAMP) after launch"
 )
 def scale_drift(x: Excitation, *, order: Order = 1, span_s: Span = 3600.0) -> Terms:
     """Each axis's scale factor drifts with time.
@@ -50,7 +50,7 @@ def scale_drift(x: Excitation, *, order: Order = 1, span_s: Span = 3600.0) -> Te
     return joined([x.scales(1e-6 * c, "ppm", f"P{k} ") for k, c in enumerate(courses, start=1)])
 
 
-@error_model("instrument", source="METHODS A3, 8", typical="a few nT over 15 min")
+@error_model("instrument", source="exponential settling", typical="a few nT over 15 min")
 def warm_up(
     x: Excitation,
     *,
@@ -69,7 +69,7 @@ def warm_up(
     return x.offsets(np.exp(-x.elapsed / tau_s), "nT")
 
 
-@error_model("instrument", source="METHODS A3, 16", typical="1 to 10 nT after a shock, or from one posture to the next")
+@error_model("instrument", source="perming of fluxgate cores", typical="1 to 10 nT after a shock, or from one posture to the next")
 def offset_step(
     x: Excitation,
     *,

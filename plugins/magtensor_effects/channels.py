@@ -17,7 +17,7 @@ ENCODER = AnyChannel("encoder*", without=ATTITUDE_ANGLES, or_units="rad", vector
 ANY = AnyChannel("*")
 
 
-@error_model("instrument", needs=("encoder*",), source="METHODS A3, 24", typical="100 nT for 1 A m2 at 1 m")
+@error_model("instrument", needs=("encoder*",), source="rotating dipole", typical="100 nT for 1 A m2 at 1 m")
 def moving_part(
     x: Excitation, *, channel: Annotated[str, ENCODER, Field(description="angle channel; '': the only one")] = ""
 ) -> Terms:
@@ -31,7 +31,7 @@ def moving_part(
     return joined([x.offsets(np.cos(angle), "nT", "cos "), x.offsets(np.sin(angle), "nT", "sin ")])
 
 
-@error_model("instrument", source="METHODS A3, 25", typical="a nT of mains beside buildings; tens from a motor")
+@error_model("instrument", source="sampled sinusoid", typical="a nT of mains beside buildings; tens from a motor")
 def periodic_interference(
     x: Excitation,
     *,
@@ -48,7 +48,7 @@ def periodic_interference(
     return joined([x.offsets(np.cos(turn), "nT", "cos "), x.offsets(np.sin(turn), "nT", "sin ")])
 
 
-@error_model("instrument", source="DESIGN section 5", typical="unknown: for channels that nobody wrote a model for")
+@error_model("instrument", source="power series of a channel", typical="unknown: for channels that nobody wrote a model for")
 def channel_response(
     x: Excitation,
     *,

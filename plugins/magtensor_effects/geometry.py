@@ -20,7 +20,7 @@ def _positions(x: Excitation) -> Array:
 
 
 @error_model(
-    "instrument", needs=("position", "gradient"), source="METHODS A3, 32", typical="1 nT for 1 mm in 1000 nT/m"
+    "instrument", needs=("position", "gradient"), source="Taylor series of the field", typical="1 nT for 1 mm in 1000 nT/m"
 )
 def position_error(x: Excitation) -> Terms:
     """A sensor's centre is not where the survey says: it sees the gradient times the offset.
@@ -39,7 +39,7 @@ def position_error(x: Excitation) -> Terms:
 @error_model(
     "instrument",
     needs=("position", "gradient", "temperature*"),
-    source="METHODS A3, 33",
+    source="thermal expansion",
     typical="23 ppm/degC for aluminium",
 )
 def baseline_expansion(x: Excitation, *, channel: Thermometer = "") -> Terms:
@@ -57,7 +57,7 @@ def baseline_expansion(x: Excitation, *, channel: Thermometer = "") -> Terms:
 @error_model(
     "instrument",
     needs=("position", "gradient"),
-    source="METHODS A3, 31",
+    source="Taylor series of the field; dipole on the axis",
     typical="0.83 (d/r)^2 of the gradient beside a dipole: 0.8 % at ten baselines",
 )
 def finite_baseline(

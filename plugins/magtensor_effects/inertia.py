@@ -13,7 +13,7 @@ from magtensor.loop.terms import Terms
 @error_model(
     "instrument",
     needs=("rotation",),
-    source="METHODS A3, 17",
+    source="first-order Taylor series; timing shifts as in Alken (DMSP) and Styp-Rekowski et al. 2021 (GRACE-FO)",
     typical="25 nT for 1 ms at 0.5 rad/s in 50 000 nT",
 )
 def sampling_lag(
@@ -35,7 +35,7 @@ def sampling_lag(
 @error_model(
     "instrument",
     needs=("rotation",),
-    source="METHODS A3, 18; Kotsiaros et al. 2020",
+    source="Kotsiaros, Connerney and Martos 2020 (Juno); nine terms of Tolles and Lawson",
     typical="25 nT for a plate of time constant 1 ms at 0.5 rad/s",
 )
 def eddy_current(x: Excitation) -> Terms:
@@ -48,7 +48,7 @@ def eddy_current(x: Excitation) -> Terms:
     return x.matrices(-x.derivative(x.field_or_fields), "s")
 
 
-@error_model("instrument", needs=("rotation",), source="METHODS A3, 19", typical="a ms between axes; small")
+@error_model("instrument", needs=("rotation",), source="first-order low-pass filter", typical="a ms between axes; small")
 def bandwidth(
     x: Excitation,
     *,
@@ -70,7 +70,7 @@ def bandwidth(
 @error_model(
     "instrument",
     needs=("rotation",),
-    source="METHODS A3, 20",
+    source="first-order Taylor series",
     typical="1 ppm over 1 h is 3.6 ms, 90 nT at 0.5 rad/s",
 )
 def clock_drift(x: Excitation) -> Terms:
@@ -82,7 +82,7 @@ def clock_drift(x: Excitation) -> Terms:
     return x.one_each(1e-6 * x.elapsed[:, None, None] * x.derivative(x.output), "ppm", "drift")
 
 
-@error_model("instrument", source="METHODS A3, 23", typical="some 100 ppm of the field beside steel; rarely known")
+@error_model("instrument", source="Debye relaxation of the magnetisation", typical="some 100 ppm of the field beside steel; rarely known")
 def viscous_magnetisation(
     x: Excitation,
     *,

@@ -16,7 +16,7 @@ UP = np.array([0.0, 0.0, 1.0])
 @error_model(
     "instrument",
     needs=("acceleration|attitude",),
-    source="METHODS A3, 26",
+    source="small rotation in proportion to the specific force",
     typical="1 arcmin is 14.5 nT, 29 nT/m on a baseline of 0.5 m",
 )
 def frame_flexure(x: Excitation) -> Terms:
@@ -45,7 +45,7 @@ def frame_flexure(x: Excitation) -> Terms:
 @error_model(
     "instrument",
     needs=("position", "gradient"),
-    source="METHODS A3, 21",
+    source="dipole field of a feedback coil",
     typical="5 nT between sensors 0.25 m apart with coils of 20 mm, 75 nT at 0.1 m",
 )
 def crosstalk(x: Excitation) -> Terms:

@@ -18,7 +18,7 @@ Supply = Annotated[str, SUPPLY, Field(description="supply voltage channel; '': t
 @error_model(
     "instrument",
     needs=("current_*",),
-    source="METHODS A3, 9",
+    source="Springmann and Cutler 2012 (RAX); Olsen et al. 2020 (CryoSat-2)",
     typical="16 nT for 1 A in a loop of 100 cm2 at 0.5 m; CryoSat-2 1 to 2 nT",
 )
 def current_field(
@@ -40,7 +40,7 @@ def current_field(
     return x.offsets(x.lagged(x.channel(name), lag_s), f"nT/{x.units[name]}")
 
 
-@error_model("instrument", needs=("supply*",), source="METHODS A3, 10", typical="10 ppm/V")
+@error_model("instrument", needs=("supply*",), source="dependence of the excitation on the supply", typical="10 ppm/V")
 def supply_scale(x: Excitation, *, channel: Supply = "") -> Terms:
     """Each axis's scale factor follows the supply voltage.
 
@@ -51,7 +51,7 @@ def supply_scale(x: Excitation, *, channel: Supply = "") -> Terms:
     return x.scales(1e-6 * x.channel(name), f"ppm/{x.units[name]}")
 
 
-@error_model("instrument", needs=("supply*",), source="METHODS A3, 11", typical="a nT/V")
+@error_model("instrument", needs=("supply*",), source="dependence of the electronics on the supply", typical="a nT/V")
 def supply_offset(x: Excitation, *, channel: Supply = "") -> Terms:
     """Each axis's offset follows the supply voltage.
 

@@ -24,7 +24,7 @@ def _total_field(x: Excitation) -> Array:
 @error_model(
     "reference",
     needs=("total_field",),
-    source="METHODS A3, 29",
+    source="spatial change of the diurnal variation",
     typical="0.1 to 1 nT; some per cent of the variation over tens of km or beside a coast",
 )
 def reference_scale(x: Excitation) -> Terms:
@@ -40,7 +40,7 @@ def reference_scale(x: Excitation) -> Terms:
 @error_model(
     "reference",
     needs=("total_field",),
-    source="METHODS A3, 30",
+    source="shift in time",
     typical="a leap second, a time zone, or the station's own filter; 0.1 nT for 1 s in a 10 nT pulsation of 10 min",
 )
 def reference_clock(
@@ -65,7 +65,7 @@ def reference_clock(
     return x.on_reference(-slope, "s", "delay")
 
 
-@error_model("reference", needs=("total_field",), source="DESIGN section 5", typical="any: the station's new place")
+@error_model("reference", needs=("total_field",), source="shift in level", typical="any: the station's new place")
 def reference_step(
     x: Excitation,
     *,

@@ -43,7 +43,7 @@ def _seen(x: Excitation, axes: Array, world: Array) -> Array:
 @error_model(
     "site",
     needs=("attitude", "position"),
-    source="METHODS A3, 27 and 28",
+    source="linear part of a harmonic potential; site of Li et al. 2018",
     typical="10 to 100 nT/m indoors; total field +-10 nT over the site of Li 2018",
 )
 def site_gradient(x: Excitation) -> Terms:
@@ -60,7 +60,7 @@ def site_gradient(x: Excitation) -> Terms:
     return joined(found)
 
 
-@error_model("site", needs=("attitude", "position"), source="METHODS A3, 27", typical="10 to 100 nT/m indoors")
+@error_model("site", needs=("attitude", "position"), source="harmonic potential about the centre of the rig", typical="10 to 100 nT/m indoors")
 def fixed_source(
     x: Excitation,
     *,
@@ -97,7 +97,7 @@ def _harmonic(name: str, places: Array) -> Array:
 
 @error_model(
     "site",
-    source="METHODS A3, 27; dipole on a straight track (Anderson functions)",
+    source="dipole on a straight track: Anderson functions",
     typical="a car of 200 A m2: 20 nT at 10 m for some seconds",
 )
 def passing_source(

@@ -24,7 +24,7 @@ ThermalLag = Annotated[
 @error_model(
     "instrument",
     needs=("temperature*",),
-    source="METHODS A3, 1 and 4",
+    source="first-order thermal lag; coefficients as in Olsen et al. 2020 (CryoSat-2)",
     typical="0.1 nT/degC for a good fluxgate; thermal lags of minutes",
 )
 def temperature_offset(x: Excitation, *, channel: Thermometer = "", lag_s: ThermalLag = 0.0) -> Terms:
@@ -41,7 +41,7 @@ def temperature_offset(x: Excitation, *, channel: Thermometer = "", lag_s: Therm
 @error_model(
     "instrument",
     needs=("temperature*",),
-    source="METHODS A3, 2",
+    source="Toffner-Clausen et al. 2016 (Swarm); Olsen et al. 2020 (CryoSat-2)",
     typical="20 ppm/degC for a fluxgate, 100 for an orthogonal one, below 1 for Swarm after correction",
 )
 def temperature_scale(x: Excitation, *, channel: Thermometer = "", lag_s: ThermalLag = 0.0) -> Terms:
@@ -57,7 +57,7 @@ def temperature_scale(x: Excitation, *, channel: Thermometer = "", lag_s: Therma
 @error_model(
     "instrument",
     needs=("temperature*",),
-    source="METHODS A3, 3",
+    source="Toffner-Clausen et al. 2016 (Swarm: currents driven by the Sun)",
     typical="a nT where sun and shade alternate (Swarm: 1.05 nT rms with it, 0.55 without)",
 )
 def temperature_rate(
