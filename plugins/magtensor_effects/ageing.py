@@ -38,7 +38,9 @@ def offset_drift(x: Excitation, *, order: Order = 1, span_s: Span = 3600.0) -> T
 
 
 @error_model(
-    "instrument", source="Yin and Luhr 2011 (CHAMP); Olsen et al. 2003 (Oersted)", typical="-79 ppm/yr (Swarm), as the logarithm of time (CHAMP) after launch"
+    "instrument",
+    source="Yin and Luhr 2011 (CHAMP); Olsen et al. 2003 (Oersted)",
+    typical="-79 ppm/yr (Swarm), as the logarithm of time (CHAMP) after launch",
 )
 def scale_drift(x: Excitation, *, order: Order = 1, span_s: Span = 3600.0) -> Terms:
     """Each axis's scale factor drifts with time.
@@ -69,7 +71,11 @@ def warm_up(
     return x.offsets(np.exp(-x.elapsed / tau_s), "nT")
 
 
-@error_model("instrument", source="perming of fluxgate cores", typical="1 to 10 nT after a shock, or from one posture to the next")
+@error_model(
+    "instrument",
+    source="perming of fluxgate cores",
+    typical="1 to 10 nT after a shock, or from one posture to the next",
+)
 def offset_step(
     x: Excitation,
     *,

@@ -48,7 +48,9 @@ def periodic_interference(
     return joined([x.offsets(np.cos(turn), "nT", "cos "), x.offsets(np.sin(turn), "nT", "sin ")])
 
 
-@error_model("instrument", source="power series of a channel", typical="unknown: for channels that nobody wrote a model for")
+@error_model(
+    "instrument", source="power series of a channel", typical="unknown: for channels that nobody wrote a model for"
+)
 def channel_response(
     x: Excitation,
     *,

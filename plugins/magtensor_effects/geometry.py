@@ -20,7 +20,10 @@ def _positions(x: Excitation) -> Array:
 
 
 @error_model(
-    "instrument", needs=("position", "gradient"), source="Taylor series of the field", typical="1 nT for 1 mm in 1000 nT/m"
+    "instrument",
+    needs=("position", "gradient"),
+    source="Taylor series of the field",
+    typical="1 nT for 1 mm in 1000 nT/m",
 )
 def position_error(x: Excitation) -> Terms:
     """A sensor's centre is not where the survey says: it sees the gradient times the offset.

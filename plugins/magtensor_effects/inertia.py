@@ -48,7 +48,9 @@ def eddy_current(x: Excitation) -> Terms:
     return x.matrices(-x.derivative(x.field_or_fields), "s")
 
 
-@error_model("instrument", needs=("rotation",), source="first-order low-pass filter", typical="a ms between axes; small")
+@error_model(
+    "instrument", needs=("rotation",), source="first-order low-pass filter", typical="a ms between axes; small"
+)
 def bandwidth(
     x: Excitation,
     *,
@@ -82,7 +84,11 @@ def clock_drift(x: Excitation) -> Terms:
     return x.one_each(1e-6 * x.elapsed[:, None, None] * x.derivative(x.output), "ppm", "drift")
 
 
-@error_model("instrument", source="Debye relaxation of the magnetisation", typical="some 100 ppm of the field beside steel; rarely known")
+@error_model(
+    "instrument",
+    source="Debye relaxation of the magnetisation",
+    typical="some 100 ppm of the field beside steel; rarely known",
+)
 def viscous_magnetisation(
     x: Excitation,
     *,

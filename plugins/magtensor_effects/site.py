@@ -60,7 +60,12 @@ def site_gradient(x: Excitation) -> Terms:
     return joined(found)
 
 
-@error_model("site", needs=("attitude", "position"), source="harmonic potential about the centre of the rig", typical="10 to 100 nT/m indoors")
+@error_model(
+    "site",
+    needs=("attitude", "position"),
+    source="harmonic potential about the centre of the rig",
+    typical="10 to 100 nT/m indoors",
+)
 def fixed_source(
     x: Excitation,
     *,

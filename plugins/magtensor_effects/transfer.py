@@ -15,7 +15,9 @@ FULL_SCALE_NT = 50000.0  # at which the coefficients of nonlinear terms are stat
 AT_FULL_SCALE = "nT at 50000 nT"
 
 
-@error_model("instrument", source="Olsen et al. 2020 (CryoSat-2)", typical="1 nT at 50 000 nT; CryoSat-2 3.2 nT with the cubic")
+@error_model(
+    "instrument", source="Olsen et al. 2020 (CryoSat-2)", typical="1 nT at 50 000 nT; CryoSat-2 3.2 nT with the cubic"
+)
 def nonlinearity_quadratic(x: Excitation) -> Terms:
     """A second-order term in each axis's transfer curve: (m / 50 000 nT) squared.
 
@@ -36,7 +38,11 @@ def nonlinearity_cubic(x: Excitation) -> Terms:
     return x.responses((x.output / FULL_SCALE_NT) ** 3, AT_FULL_SCALE)
 
 
-@error_model("instrument", source="transverse sensitivity of uncompensated fluxgates", typical="1 to 20 nT without vector compensation")
+@error_model(
+    "instrument",
+    source="transverse sensitivity of uncompensated fluxgates",
+    typical="1 to 20 nT without vector compensation",
+)
 def cross_field(x: Excitation) -> Terms:
     """Each axis answers to the field across it: to the product of the two transverse outputs and to the
     difference of their squares.
@@ -55,7 +61,9 @@ def cross_field(x: Excitation) -> Terms:
     )
 
 
-@error_model("instrument", source="play operator of Prandtl and Ishlinskii", typical="below 2 nT after twice the full scale")
+@error_model(
+    "instrument", source="play operator of Prandtl and Ishlinskii", typical="below 2 nT after twice the full scale"
+)
 def hysteresis(
     x: Excitation,
     *,
