@@ -24,5 +24,8 @@ lint: $(STAMP)
 test: lint
 	$(BIN)/pytest -n auto
 
+papers: $(STAMP)
+	$(BIN)/python studies/papers.py
+
 clean:
 	rm -rf $(VENV) demo
