@@ -48,6 +48,7 @@ def close_loop(
     from magtensor.loop.record import record_of
     from magtensor.loop.search import search as find
     from magtensor.loop.stored import cleaned, effect_variables
+    from magtensor.loop.unexplained import unexplained
 
     record = record_of(survey)
     if len(record.time) < 2:
@@ -61,6 +62,7 @@ def close_loop(
     raw, field = without(record, [a.terms(last.excitation) for a in last.adopted], last.theta)
     calibration = calibrated(last.fit, field, raw, reference_noise_nT)
     outcome = {"declared": ["linear", *(a.name for a in begin)]} | described(found, record, len(begin))
+    outcome["unexplained"] = unexplained(found, record)
     keep = last.fit.keep
     before = held_out_error(record, begin, how, first.theta, keep)
     same = len(last.adopted) == len(begin)

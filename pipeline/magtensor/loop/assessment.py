@@ -8,10 +8,10 @@ import numpy as np
 
 from magtensor.calibration.types import Array
 from magtensor.loop.colour import Colour, colour_of
-from magtensor.loop.evidence import Grams, grams, normal
+from magtensor.loop.evidence import grams, normal
 from magtensor.loop.residual import Residual, taken_off
 from magtensor.loop.statistics import Estimate, Gain, family_p, held_out_gain, own_information, solve
-from magtensor.loop.terms import Terms
+from magtensor.loop.terms import Terms, joined
 
 FINEST_BLOCKS = 120
 LEAST_PER_BLOCK = 4
@@ -41,16 +41,16 @@ class Assessment:
 
     Attributes:
         estimate: coefficients, covariance (in noise of the fitted colour), information.
-        gain: on held-out blocks.
-        p: that all coefficients are zero.
-        grams: the blocks, for further questions.
+        gain: on held-out blocks, in noise whose colour is found when the terms have explained their part.
+        null_gain: the same in noise whose colour is found without them: what the null hypothesis says of the noise.
+        p: that all coefficients are zero, in noise of the null hypothesis' colour.
         colours: under the hypothesis that the terms are real.
     """
 
     estimate: Estimate
     gain: Gain
+    null_gain: Gain
     p: float
-    grams: Grams
     colours: Colours
 
 
@@ -59,32 +59,40 @@ def block_count(samples: int) -> int:
     return int(np.clip(samples // LEAST_PER_BLOCK, 1, FINEST_BLOCKS))
 
 
-def assess(residual: Residual, terms: Terms, colours: Colours, *, significance: bool = True) -> Assessment:
-    """Assess terms that no model holds yet.
+def assess(residual: Residual, terms: Terms, colours: Colours, given: Terms | None = None) -> Assessment:
+    """Assess terms that no model holds yet, the coefficients of the given ones being free as well.
 
-    The noise is what is left when the terms have explained their part: colour estimated from a residual that still
-    holds a strong effect would call the effect noise.
+    Two colours of noise are needed. A test of the null hypothesis uses the colour of the residual as it is: slow noise
+    that a flexible model could follow must count as noise. How much the terms explain, and how well they compare with
+    others, is asked in the colour of what they leave: seen in the first colour, a strong slow effect is itself noise.
 
     Parameters
     ----------
     residual: of the current model.
     terms: with the residual's samples as rows.
-    colours: of the residual, to start from.
-    significance: also compute the p value, the dearest part.
+    colours: of the residual.
+    given: terms of the current model, whose coefficients are fitted along.
     """
+    together = terms if given is None else joined([given, terms])
+    first = together.count - terms.count
+    own = list(range(first, together.count))
+    blocked = np.arange(together.count) < first
+    count = block_count(len(residual.affine))
+    null = grams(residual, together, colours.across, colours.along, count)
+    p = family_p(null, together.sensors, own)
+    null_gain = held_out_gain(null, residual.freedom, blocked)
+    now = colours
     for _ in range(_ROUNDS):
-        estimate = estimated(residual, terms, colours)
-        after = colours_of(taken_off(residual, terms, estimate.theta))
-        if _alike(after, colours):
-            colours = after
+        estimate = estimated(residual, together, now)
+        after = colours_of(taken_off(residual, together, estimate.theta))
+        settled = _alike(after, now)
+        now = after
+        if settled:
             break
-        colours = after
-    blocks = grams(residual, terms, colours.across, colours.along, block_count(len(residual.affine)))
+    blocks = grams(residual, together, now.across, now.along, count)
     n, y = normal(blocks.total())
     estimate = solve(n[0], y[0], own_information(blocks))
-    gain = held_out_gain(blocks, residual.freedom)
-    p = family_p(blocks, terms.sensors) if significance else float("nan")
-    return Assessment(estimate, gain, p, blocks, colours)
+    return Assessment(estimate, held_out_gain(blocks, residual.freedom, blocked), null_gain, p, now)
 
 
 def estimated(residual: Residual, terms: Terms, colours: Colours) -> Estimate:

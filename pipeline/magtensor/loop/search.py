@@ -32,6 +32,7 @@ SCREENED = 8  # models looked at closely in each step
 SCREENING_SAMPLES = 4000  # settings are profiled on so many samples
 MOST_EFFECTS = 8
 _REFINEMENTS = 8
+POLISH = 0.1  # of a setting, to either side
 
 WHITE = Colours(Colour(None, 1.0), Colour(None, 1.0))
 
@@ -59,9 +60,9 @@ class Candidate:
     @property
     def passes(self) -> bool:
         """Both gates."""
-        gain = self.assessment.gain
+        gain, null = self.assessment.gain, self.assessment.null_gain
         reduction = gain.total / max(float(gain.before.sum()), 1e-300)
-        return self.adjusted_p < self.alpha and gain.consistent and reduction > LEAST_REDUCTION
+        return self.adjusted_p < self.alpha and null.total > 0 and gain.consistent and reduction > LEAST_REDUCTION
 
 
 @dataclass(frozen=True)
@@ -138,7 +139,7 @@ def search(
         chosen, rivals = _simplest(best, candidates, state)
         if say is not None:
             say(f"adopting {chosen.model.name}")
-        after = _adopt(record, state, chosen, how)
+        after = _polished(record, _adopt(record, state, chosen, how), how)
         after, dropped = _eliminate(record, after, how, len(declared))
         steps.append(Step(state, tuple(candidates), chosen, rivals, dropped))
         if chosen.model.name in dropped and len(after.adopted) <= len(state.adopted):
@@ -237,7 +238,7 @@ def _candidates(
         terms = _terms(model, settings, state.excitation, failed)
         assert terms is not None
         terms = terms.at(residual.samples)
-        assessment = _assess_given(residual, terms, state)
+        assessment = assess(residual, terms, state.colours, state.terms)
         found.append((Adopted(model, settings), tried + refined, terms, assessment))
     order = sorted(range(len(found)), key=lambda i: min(1.0, found[i][3].p * found[i][1]))
     adjusted = np.ones(len(found))
@@ -289,23 +290,6 @@ class _Scorer:
         return (explained(estimate) - self.own - rank) / float(np.sqrt(2.0 * rank))
 
 
-def _assess_given(residual: Residual, terms: Terms, state: State, colours: Colours | None = None) -> Assessment:
-    """Assess terms, the adopted models' coefficients being free as well."""
-    from dataclasses import replace
-
-    start = colours or state.colours
-    if state.terms is None:
-        return assess(residual, terms, start)
-    together = joined([state.terms, terms])
-    found = assess(residual, together, start, significance=False)
-    own = np.arange(state.terms.count, together.count)
-    blocked = np.zeros(together.count, dtype=bool)
-    blocked[: state.terms.count] = True
-    return replace(
-        found, p=family_p(found.grams, together.sensors, own.tolist()), gain=held_out_gain(found.grams, residual.freedom, blocked)
-    )
-
-
 def _refined(
     residual: Residual, model: Component, settings: dict[str, Any], state: State, failed: dict[str, str]
 ) -> tuple[dict[str, Any], int]:
@@ -320,7 +304,7 @@ def _refined(
         terms = _terms(model, settings, state.excitation, failed)
         if terms is None or high <= low:
             continue
-        colours = _assess_given(residual, terms.at(residual.samples), state).colours
+        colours = assess(residual, terms.at(residual.samples), state.colours, state.terms).colours
         score = _Scorer(residual, state.terms, colours)
 
         def gain(value: float, name: str = name, score: _Scorer = score, rest: dict[str, Any] = settings) -> float:
@@ -396,6 +380,35 @@ def _adopt(record: Record, state: State, chosen: Candidate, how: Fitting) -> Sta
     every = chosen.terms
     keep = [i for i, s in enumerate(every.sensors) if s in sensors or s == ""]
     return joint_state(record, [*state.adopted, narrowed], how, [*state.theta, after.theta[-1][keep]])
+
+
+def _polished(record: Record, state: State, how: Fitting) -> State:
+    """The settings on a range, sought once more now that everything is fitted together; a setting that is a little
+    off leaves a residual that another model would be adopted for."""
+    for number, model in enumerate(state.adopted):
+        for name, grid in profiled(model.component).items():
+            if not isinstance(grid, Range) or not state.adopted[number].settings[name]:
+                continue
+            now = state.adopted[number]
+            own = _slices(state)[number]
+            assert state.terms is not None
+            mine = state.terms.only(range(own.start, own.stop))
+            others = [i for i in range(state.terms.count) if not own.start <= i < own.stop]
+            back = put_back(state.residual, mine, state.theta[number])
+            score = _Scorer(back, state.terms.only(others) if others else None, state.colours)
+            at = state
+
+            def gain(value: float, name: str = name, now: Adopted = now, score: _Scorer = score, at: State = at) -> float:
+                trial = Adopted(now.component, {**now.settings, name: value}, now.sensors)
+                return score(trial.terms(at.excitation).at(at.residual.samples))
+
+            here = float(now.settings[name])
+            best, _ = _golden(gain, here * (1 - POLISH), here * (1 + POLISH), here)
+            if best != here:
+                changed = Adopted(now.component, {**now.settings, name: best}, now.sensors)
+                models = [changed if i == number else a for i, a in enumerate(state.adopted)]
+                state = joint_state(record, models, how, state.theta)
+    return state
 
 
 def _slices(state: State) -> list[slice]:

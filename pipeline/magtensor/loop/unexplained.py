@@ -1,0 +1,204 @@
+"""What is left when the search has ended: is it noise, and if not, what does it look like?
+
+Independent sensors have independent noise, white or slow. So what is left is called unexplained only where noise
+cannot make it: a waveform that the sensors share, a line in the spectrum, or an error model that is significant and
+yet does not predict held-out data.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from magtensor.calibration.types import Array
+from magtensor.loop.model import Record, State
+from magtensor.loop.search import Candidate, Search
+
+ALPHA = 0.005  # of each of the tests
+SURROGATES = 199
+BINS = 120  # the common waveform is looked for in means of so many stretches
+MOST_LAG = 0.1  # of the survey, in which a channel is compared with the waveform
+
+
+@dataclass(frozen=True)
+class Waveform:
+    """The strongest waveform the sensors share.
+
+    Attributes:
+        time: (K,) s; values: (K,) of unit rms; direction: (S, 3) nT per unit at each sensor, off the common plane.
+        share: of the slow residual's variance; p: of a share as large among independent noise.
+    """
+
+    time: Array
+    values: Array
+    direction: Array
+    share: float
+    p: float
+
+
+def unexplained(found: Search, record: Record) -> dict[str, Any]:
+    """The `unexplained` block of the contract."""
+    state = found.last
+    residual = state.residual
+    excess = float(np.sqrt(max(residual.square() - 1.0, 0.0)) * residual.scale)
+    waveform = common_waveform(state, record)
+    line = strongest_line(state, record)
+    last = found.steps[-1].candidates if found.steps else ()
+    suspects = [c for c in last if c.adjusted_p < c.alpha]
+    words: list[str] = []
+    if waveform is not None and waveform.p <= ALPHA:
+        words.append(_waveform_words(waveform, record))
+    if line is not None:
+        words.append(f"a line at {line[0]:.4g} Hz (period {1 / line[0]:.4g} s), {line[1]:.3g} nT rms")
+    if suspects:
+        names = ", ".join(c.model.name for c in suspects)
+        words.append(f"significant but of no use on held-out blocks: {names}")
+    present = bool(words)
+    if present:
+        words.insert(0, f"{excess:.3g} nT rms above the white noise, mostly on {_sensors(state)}")
+    return {
+        "present": present,
+        "excess_rms_nT": excess,
+        "description": "; ".join(words) if present else "what is left is noise: white, and slow noise of each sensor alone",
+        "looks_like": _looks_like(last) if present else [],
+    }
+
+
+def common_waveform(state: State, record: Record) -> Waveform | None:
+    """The first principal component of the slow residual over the sensors, judged against shifted copies.
+
+    Every coordinate off the plane is shifted in time by a random amount, which keeps its own spectrum and breaks what
+    it has in common with the others.
+    """
+    residual = state.residual
+    if residual.across is None or len(residual.affine) < 4 * BINS:
+        return None
+    values, vectors = np.linalg.eigh(residual.projector)
+    basis = vectors[:, values > 0.5]
+    n = len(residual.affine) // BINS * BINS
+    coordinates = residual.across @ basis
+    slow = coordinates[:n].reshape(BINS, -1, basis.shape[1]).mean(axis=1)
+    slow = slow / np.maximum(slow.std(axis=0), 1e-300)
+    share = _leading(slow)
+    rng = np.random.default_rng(20171)
+    surrogate = np.empty(SURROGATES)
+    for k in range(SURROGATES):
+        shifts = rng.integers(0, BINS, slow.shape[1])
+        surrogate[k] = _leading(np.column_stack([np.roll(c, s) for c, s in zip(slow.T, shifts, strict=True)]))
+    p = float((1 + np.sum(surrogate >= share)) / (SURROGATES + 1))
+    raw = coordinates[:n].reshape(BINS, -1, basis.shape[1]).mean(axis=1)
+    u, s, vt = np.linalg.svd(raw - raw.mean(axis=0), full_matrices=False)
+    wave = u[:, 0] * np.sqrt(BINS)
+    direction = (basis @ vt[0] * s[0] / np.sqrt(BINS)) * residual.noise
+    time = record.time[residual.samples[:n]].reshape(BINS, -1).mean(axis=1)
+    return Waveform(time, wave, direction.reshape(-1, 3), share, p)
+
+
+def _leading(slow: Array) -> float:
+    s = np.linalg.svd(slow - slow.mean(axis=0), compute_uv=False)
+    return float(s[0] ** 2 / np.sum(s**2))
+
+
+def strongest_line(state: State, record: Record) -> tuple[float, float] | None:
+    """Frequency in Hz and rms in nT of a spectral line that noise does not make; None without one."""
+    lines = spectral_lines(state, record)
+    return (lines[0][0], lines[0][1]) if lines and lines[0][2] < ALPHA else None
+
+
+def spectral_lines(state: State, record: Record, most: int = 5) -> list[tuple[float, float, float]]:
+    """(frequency Hz, rms nT, p) of the strongest peaks of the residual over its smooth spectrum.
+
+    The residual is multiplied by each of (1, direction), because a line of the platform shows unturned.
+    """
+    from scipy.fft import rfft
+    from scipy.stats import chi2
+
+    residual = state.residual
+    time = record.time[residual.samples]
+    if len(time) < 256 or residual.across is None:
+        return []
+    step = np.median(np.diff(time))
+    if np.max(np.abs(np.diff(time) - step)) > 0.5 * step:
+        return []
+    values, vectors = np.linalg.eigh(residual.projector)
+    coordinates = residual.across @ vectors[:, values > 0.5]
+    n, k = coordinates.shape
+    power = np.sum(np.abs(rfft(coordinates, axis=0)) ** 2, axis=1)[1:] / n
+    frequency = np.arange(1, len(power) + 1) / (n * step)
+    smooth = _running_median(power, max(len(power) // 100, 15))
+    ratio = power / np.maximum(smooth, 1e-300) * chi2.median(2 * k) / 2.0  # to the scale of k exponentials' sum
+    order = np.argsort(-ratio)
+    peaks: list[tuple[float, float, float]] = []
+    for i in order:
+        if len(peaks) == most:
+            break
+        if any(abs(frequency[i] - f) < 3.0 / (n * step) for f, _, _ in peaks):
+            continue
+        p = min(1.0, float(chi2.sf(2.0 * ratio[i], 2 * k)) * len(power))
+        amplitude = float(np.sqrt(2.0 * power[i] / n / k) * residual.scale)
+        peaks.append((float(frequency[i]), amplitude, p))
+    return peaks
+
+
+def _running_median(values: Array, width: int) -> Array:
+    from scipy.ndimage import median_filter
+
+    out: Array = median_filter(values, size=2 * width + 1, mode="nearest")
+    return out
+
+
+def _sensors(state: State) -> str:
+    across = state.residual.across
+    if across is None:
+        return ", ".join(state.excitation.sensors)
+    each = np.mean(across.reshape(len(across), -1, 3) ** 2, axis=(0, 2))
+    order = np.argsort(-each)
+    top = [i for i in order if each[i] > 0.7 * each[order[0]]]
+    return "all sensors" if len(top) == len(each) else ", ".join(state.excitation.sensors[i] for i in sorted(top))
+
+
+def _waveform_words(waveform: Waveform, record: Record) -> str:
+    strength = np.sqrt(np.sum(waveform.direction**2, axis=1))
+    each = ", ".join(f"{s} {a:.2g} nT" for s, a in zip(record.sensors, strength, strict=True))
+    words = f"the sensors share one waveform ({waveform.share:.0%} of the slow residual; {each})"
+    followed = _followed(waveform, record)
+    if followed is not None:
+        name, lag, power, correlation = followed
+        to_the = "" if power == 1 else f" to the power {power}"
+        words += f", most like channel {name}{to_the} with a lag of {lag:.3g} s (correlation {correlation:+.2f})"
+    else:
+        words += ", which follows no logged channel"
+    return words
+
+
+def _followed(waveform: Waveform, record: Record) -> tuple[str, float, int, float] | None:
+    """The channel, lag, power and correlation that come nearest to the waveform, if they come near."""
+    step = float(np.median(np.diff(waveform.time)))
+    most = max(1, int(MOST_LAG * len(waveform.time)))
+    best: tuple[str, float, int, float] | None = None
+    for name, values in record.logged.items():
+        for column in values.reshape(len(values), -1).T:
+            sampled = np.interp(waveform.time, record.time, column)
+            for power in (1, 2, 3):
+                series = sampled**power
+                if series.std() == 0:
+                    continue
+                for shift in range(most + 1):
+                    a = waveform.values[shift:]
+                    b = series[: len(series) - shift]
+                    if b.std() == 0:
+                        continue
+                    c = float(np.corrcoef(a, b)[0, 1])
+                    if best is None or abs(c) > abs(best[3]) + 0.01:
+                        best = (name, shift * step, power, c)
+    return best if best is not None and abs(best[3]) > 0.7 else None
+
+
+def _looks_like(candidates: Sequence[Candidate]) -> list[str]:
+    """The models that come nearest to explaining it, most significant first."""
+    near = sorted((c for c in candidates if c.adjusted_p < 0.05), key=lambda c: c.adjusted_p)
+    return [c.model.name for c in near[:5]]
+
