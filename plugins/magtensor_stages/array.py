@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 @stage(
     needs=("b_raw", "calibrated/b", "calibration/matrix", "calibration/offset", "calibration/covariance"),
     uses=("total_field", "calibration/fit_rms"),
-    gives=("calibration/*", "calibration/rotation", "calibrated/b", "residual/contrast"),
-    may_give=("residual/total_field", "residual/total_field_before"),
+    gives=("calibration/*", "calibration/rotation", "calibrated/b"),
+    may_give=("residual/contrast", "residual/total_field", "residual/total_field_before"),
 )
 def align(
     survey: Survey,
@@ -59,7 +59,7 @@ def align(
     if "total_field" in survey:
         good &= np.isfinite(survey.values("total_field"))
     reference = sensors.index(to) if to is not None else 0
-    with naming(sensors):
+    with naming(survey):
         aligned = method(b[good], calibrations, reference)
     return common_frame(survey, aligned, method.__name__)
 
@@ -95,6 +95,6 @@ def assemble_tensor(survey: Survey, *, method: MethodChoice = "least_squares") -
     total_field = survey.values("total_field") if "total_field" in survey else None
     noise = noise_std(b[good], None if total_field is None else total_field[good])
     known = bool(np.isfinite(noise).all() and (noise > 0).all())
-    with naming(survey.sensors):
+    with naming(survey):
         assembly = method(position, np.diag(noise.ravel() ** 2) if known else None)
     return assembly_variables(assembly, position, noise) | assembled(assembly, b, position, noise, restored(survey))

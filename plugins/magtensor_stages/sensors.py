@@ -35,11 +35,11 @@ def each_sensor(survey: Survey, fit: Callable[[int, np.ndarray], SensorCalibrati
         good = usable(survey, i)
         source = str(survey.attributes.get("source", ""))
         if not good.any():
-            raise NotEnoughData("no sample is left in use", where=f"{source} sensor {name}".strip())
+            raise NotEnoughData("no sample is left in use", where=": ".join(p for p in (source, f"sensor {name}") if p))
         try:
             calibrations.append(fit(i, good))
         except DataError as error:
-            place = " ".join(p for p in (source, f"sensor {name}", error.where) if p)
+            place = ": ".join(p for p in (source, f"sensor {name}", error.where) if p)
             raise type(error)(error.what, where=place, hint=error.hint) from error
     return calibrations
 
@@ -56,13 +56,14 @@ def by_name(text: str, sensors: list[str]) -> str:
 
 
 @contextmanager
-def naming(sensors: list[str]) -> Iterator[None]:
-    """Methods count the sensors from 1; what they refuse, the user reads with the sensors' names."""
+def naming(survey: Survey) -> Iterator[None]:
+    """Methods know no file and count the sensors from 1; what they refuse, the user reads with the names of both."""
     try:
         yield
     except DataError as error:
-        what, where, hint = (by_name(text, sensors) for text in (error.what, error.where, error.hint))
-        raise type(error)(what, where=where, hint=hint) from error
+        what, where, hint = (by_name(text, survey.sensors) for text in (error.what, error.where, error.hint))
+        source = str(survey.attributes.get("source", ""))
+        raise type(error)(what, where=": ".join(p for p in (source, where) if p), hint=hint) from error
 
 
 def side_by_side(calibrations: list[SensorCalibration]) -> ArrayCalibration:
@@ -119,8 +120,10 @@ def calibrate_array(survey: Survey, *, method: MethodChoice = "joint") -> dict[s
     raw, total_field = survey.values("b_raw"), survey.values("total_field")
     good = survey.good & np.isfinite(total_field) & np.isfinite(raw).all(axis=(1, 2))
     if not good.any():
-        raise NotEnoughData("no sample has all sensors in use and a total field")
-    with naming(survey.sensors):
+        raise NotEnoughData(
+            "no sample has all sensors in use and a total field", where=str(survey.attributes.get("source", ""))
+        )
+    with naming(survey):
         calibration = method(raw[good], total_field[good])
     given = common_frame(survey, calibration, method.__name__)
     if calibration.kept is not None and not calibration.kept.all():
@@ -167,7 +170,10 @@ def common_frame(survey: Survey, calibration: ArrayCalibration, method: str) -> 
         calibration,
         frame=by_name(calibration.frame, names),
         unobservable=tuple(by_name(words, names) for words in calibration.unobservable),
-        diagnostics={by_name(key, names): value for key, value in calibration.diagnostics.items()},
+        diagnostics={
+            by_name(key, names): by_name(value, names) if isinstance(value, str) else value
+            for key, value in calibration.diagnostics.items()
+        },
     )
     given = stored(calibration, survey.sensors, method=method) | corrected(calibration, survey)
     rotation = np.stack([rotation_and_upper(m)[0] for m in calibration.matrix])

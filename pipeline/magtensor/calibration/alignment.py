@@ -12,14 +12,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from magtensor.errors import DataError
+from magtensor.errors import DataError, NotEnoughData
 
-from .axes import axis_faults
+from .agreement import require_agreement
+from .axes import axis_faults, turned_words
 from .covariance import Influence, scalar_influence
 from .factors import CHOLESKY, POLAR
 from .rotation import LI_SEQUENCE, cross_matrix, nearest_orthogonal, sequence, sequence_derivatives
 from .types import PARAMETERS_PER_SENSOR, Array, ArrayCalibration, SensorCalibration
 
+LEAST_SAMPLES = 4  # a rotation has three angles
 COMMON_ROTATION = "one rotation common to all sensors: scalar data do not tie the frame to the platform"
 
 
@@ -212,10 +214,16 @@ def align(
 
     Raises
     ------
-    DataError: a sensor has an inverted axis or two swapped ones; the message says which.
+    NotEnoughData: fewer than four samples in which all sensors may be used.
+    DataError: a sensor has an inverted axis or two swapped ones, or sees another field; the message says which.
     """
     b = np.asarray(b, dtype=float)
     sensors = b.shape[1]
+    if len(b) < LEAST_SAMPLES:
+        raise NotEnoughData(
+            f"{len(b)} samples in which every sensor may be used cannot align them",
+            hint=f"at least {LEAST_SAMPLES} are needed; the flag record says which samples of which sensor were left out",
+        )
     if len(calibrations) != sensors or not 0 <= reference < sensors:
         raise ValueError(f"{sensors} sensors, {len(calibrations)} calibrations, reference {reference}")
     if not np.isfinite(b).all():
@@ -229,6 +237,9 @@ def align(
     rotation = np.array([a.rotation for a in found])
     offset = np.array([c.offset for c in calibrations])
     matrix = rotation @ np.array([c.matrix for c in calibrations])
+    require_agreement(
+        np.einsum("sij,nsj->nsi", rotation, b), np.linalg.norm(b[:, reference], axis=1)
+    )
     planar = [s for s in range(sensors) if hands[s].undetermined and s != reference]
     unobservable = [COMMON_ROTATION]
     if planar:
@@ -242,6 +253,7 @@ def align(
         for s in range(sensors)
         if s != reference
     }
+    diagnostics["axes"] = "; ".join(turned_words(matrix))
     return ArrayCalibration(
         matrix,
         offset,

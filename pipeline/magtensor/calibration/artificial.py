@@ -14,6 +14,7 @@ import numpy as np
 
 from magtensor.errors import DataError
 
+from .agreement import require_agreement
 from .alignment import COMMON_ROTATION, handedness
 from .axes import axis_faults
 from .covariance import scalar_influence
@@ -47,8 +48,13 @@ def calibrate_to_mean(
     DataError: inverted or swapped axes, named.
     """
     raw = np.asarray(raw, dtype=float)
-    if raw.ndim != 3 or raw.shape[2] != 3 or raw.shape[1] < 2:
-        raise ValueError(f"raw {raw.shape} is not (N, S, 3) with two sensors or more")
+    if raw.ndim != 3 or raw.shape[2] != 3:
+        raise ValueError(f"raw {raw.shape} is not (N, S, 3)")
+    if raw.shape[1] < 2:
+        raise DataError(
+            "there is only one sensor, and the mean of all sensors is itself",
+            hint="calibrate_scalar calibrates a single sensor",
+        )
     sensors = raw.shape[1]
     alone = []
     for s in range(sensors):
@@ -57,7 +63,7 @@ def calibrate_to_mean(
         except DataError as error:
             where = f"sensor {s + 1}" + (f", {error.where}" if error.where else "")
             raise type(error)(error.what, where=where, hint=error.hint) from error
-    _refuse_turned_axes(raw, alone)
+    _refuse_turned_axes(raw, total_field, alone)
     mean = raw.mean(axis=1)
     platform = calibrate_sensor(*checked_samples(mean, total_field))
     reference = platform.apply(mean)
@@ -86,13 +92,14 @@ def calibrate_to_mean(
     )
 
 
-def _refuse_turned_axes(raw: Array, alone: list[SensorCalibration]) -> None:
+def _refuse_turned_axes(raw: Array, total_field: Array, alone: list[SensorCalibration]) -> None:
     """The mean is a sensor only where all sensors have like axes."""
     b = [c.apply(raw[:, s]) for s, c in enumerate(alone)]
     maps = []
     for s in range(len(alone)):
         hand = handedness(b[0], b[s])
         maps.append(hand.mirror if hand.mirrored else nearest_orthogonal(b[0].T @ b[s], 1))
+    require_agreement(np.stack([x @ m.T for x, m in zip(b, maps, strict=True)], axis=1), total_field)
     words = axis_faults(np.array(maps), 0, [f"sensor {s + 1}" for s in range(len(alone))])
     if words:
         raise DataError(

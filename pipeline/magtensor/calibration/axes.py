@@ -89,5 +89,35 @@ def axis_faults(rotations: Array, reference: int, names: Sequence[str]) -> tuple
     return tuple(words for words in found if words)
 
 
+def mirrored_words(matrix: Array) -> tuple[str, ...]:
+    """Words for every sensor that is mirrored against the majority, from corrections that lead to one frame.
+
+    Which of two halves is the mirrored one cannot be told; then the first sensor is taken for right.
+
+    Parameters
+    ----------
+    matrix: (S, 3, 3) corrections, of whatever handedness.
+    """
+    hands = np.sign(np.linalg.det(matrix))
+    right = np.sign(hands.sum()) or hands[0]
+    reference = int(np.flatnonzero(hands == right)[0])
+    maps = _against(matrix, reference)
+    maps[hands == right] = np.eye(3)
+    return axis_faults(maps, reference, [f"sensor {s + 1}" for s in range(len(matrix))])
+
+
+def turned_words(matrix: Array) -> tuple[str, ...]:
+    """Words for every sensor whose axes lie along others than the first's: not a fault, but worth knowing."""
+    return axis_faults(_against(matrix, 0), 0, [f"sensor {s + 1}" for s in range(len(matrix))])
+
+
+def _against(matrix: Array, reference: int) -> Array:
+    """(S, 3, 3) orthogonal maps from each sensor's raw axes to the reference's."""
+    u, _, vt = np.linalg.svd(matrix)
+    rotation = u @ vt
+    out: Array = rotation[reference].T @ rotation
+    return out
+
+
 def _listed(words: Sequence[str]) -> str:
     return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)

@@ -15,11 +15,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from magtensor.errors import NotEnoughData
+from magtensor.errors import DataError, NotEnoughData
 
+from .agreement import require_agreement
+from .axes import mirrored_words, turned_words
 from .common_field import CommonField, common_field, output_noise
 from .coverage import WORST_ERROR, coverage, require_coverage
 from .maximum_likelihood import ScalarFit, fit_scalar
+from .scalar import checked_samples
 from .types import Array, ArrayCalibration
 
 FALSE_REJECTION = 0.01  # probability that one clean sample of the whole survey is rejected
@@ -69,7 +72,9 @@ def fit_joint(
     Raises
     ------
     NotEnoughData: the attitudes do not determine the parameters; the message says which are missing.
+    DataError: a mirrored sensor, or one that does not see the field of the others.
     """
+    checked_samples(raw[:, 0], total_field)
     judge = keep is None and robust and len(raw) >= LEAST_FOR_REJECTION
     keep = np.ones(len(raw), dtype=bool) if keep is None else keep
     sensors = raw.shape[1]
@@ -77,7 +82,11 @@ def fit_joint(
     for _ in range(20):
         plane = common_field(raw, given, keep)
         y = plane.coordinates(raw)
-        scalar = fit_scalar(y[keep], total_field[keep], reference_noise)
+        try:
+            scalar = fit_scalar(y[keep], total_field[keep], reference_noise)
+        except DataError:
+            require_coverage(coverage(raw[keep, 0], total_field[keep]))
+            raise
         if sensors == 1 and noise is None:
             # one sensor has no neighbour to find its noise by: the residual along the field is all there is
             given = np.full((1, 3), float(plane.noise[0]) * np.sqrt(scalar.chi2))
@@ -102,7 +111,20 @@ def fit_joint(
     field = (y[keep] - scalar.offset) @ scalar.matrix.T @ nearest_frame(forward)
     seen = coverage(field, total_field[keep], matrix=np.eye(3), offset=np.zeros(3), worst_error=worst_error)
     require_coverage(seen)
+    _refuse_sensors(forward, offset, raw[keep], total_field[keep])
     return JointFit(forward, offset, plane, scalar, keep)
+
+
+def _refuse_sensors(forward: Array, offset: Array, raw: Array, total_field: Array) -> None:
+    """Mirrored sensors, and those that have nothing in common with the others, whose C is next to singular."""
+    some = slice(None, None, max(1, len(raw) // 20_000))
+    correction = np.linalg.pinv(forward, rcond=1e-9)
+    require_agreement(np.einsum("sij,nsj->nsi", correction, raw[some] - offset), total_field[some])
+    words = mirrored_words(correction)
+    if words:
+        raise DataError(
+            "; ".join(words), hint="correct the sign or the order of the named axes when loading the survey"
+        )
 
 
 def _unfold(plane: CommonField, scalar: ScalarFit, sensors: int) -> tuple[Array, Array]:
@@ -181,6 +203,7 @@ def calibrated(fit: JointFit, total_field: Array, raw: Array, reference_noise: f
             "chi2_total_field": fit.scalar.chi2,
             "chi2_contrasts": fit.plane.chi2,
             "noise_nT": float(np.sqrt(np.mean(fit.plane.noise**2))),
+            "axes": "; ".join(turned_words(matrix)),
         },
         fit.keep,
     )
