@@ -86,8 +86,7 @@ def _table_2(found: dict[str, Array], wrong: dict[str, Array], runs: int) -> Com
         f"{runs} surveys of 200 attitudes, noise of variance 9 nT²; recipe `chi2017.yaml`.",
         [*matrix, *offset, *rotation],
         [
-            f"The twelve offsets differ by {np.sqrt(np.mean(offsets**2)):.1f} spreads rms where 1.0 is expected, "
-            "the other figures by what chance gives.",
+            f"The twelve offsets differ by {np.sqrt(np.mean(offsets**2)):.1f} spreads rms, where 1.0 is expected.",
             "psi of sensor 1 is printed +0.025 rad in Table 1. The scenario has -0.025: with the printed sign the "
             f"recipe gives elements 13 and 23 of sensor 1 off by {signs[0][2]:+.3f} and {signs[0][4]:+.3f} and b_y by "
             f"{signs[1][1]:+.0f} nT.",
