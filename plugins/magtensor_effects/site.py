@@ -108,10 +108,10 @@ def _harmonic(name: str, places: Array) -> Array:
 def passing_source(
     x: Excitation,
     *,
-    time_s: Annotated[float, EventTimes(), Field(description="when it is nearest, s since the survey's start")] = 0.0,
+    time_s: Annotated[float, EventTimes(100), Field(description="when it is nearest, s since the survey's start")] = 0.0,
     passage_s: Annotated[
         float,
-        Range(0.5, 60.0, count=4, spacing="log"),
+        Range(0.005, 0.1, count=3, spacing="log", of_duration=True),
         Field(gt=0, description="smallest distance over speed, s"),
     ] = 5.0,
     whole: Annotated[
