@@ -13,8 +13,9 @@ $(STAMP): pyproject.toml
 
 demo: $(STAMP)
 	rm -rf demo
-	$(BIN)/magtensor simulate recipes/scenarios/demo.yaml --output demo/survey.h5
-	$(BIN)/magtensor run recipes/demo.yaml --input demo/survey.h5 --output demo/result
+	$(BIN)/magtensor simulate recipes/scenarios/undeclared_temperature.yaml --output demo/survey.h5
+	$(BIN)/magtensor simulate recipes/scenarios/undeclared_temperature_verify.yaml --output demo/verify.h5
+	$(BIN)/magtensor run recipes/closed_loop.yaml --input demo/survey.h5 --verify demo/verify.h5 --output demo/result
 
 lint: $(STAMP)
 	$(BIN)/ruff check .

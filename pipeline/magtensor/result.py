@@ -36,9 +36,18 @@ def write(directory: Path, survey: Survey, made_by: Provenance, outcome: dict[st
         _save(tree, made_by, folder / RESULT)
         if "calibration" in tree.children:
             _save(_only(tree, "calibration"), made_by, folder / CALIBRATION)
-        (folder / VERDICT).write_text(json.dumps(outcome, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+        (folder / VERDICT).write_text(json.dumps(finite(outcome), indent=2, allow_nan=False) + "\n", encoding="utf-8")
         _report(folder)
     return made_by
+
+
+def finite(value: Any) -> Any:
+    """The same with what is not a finite number as None: JSON knows no NaN."""
+    if isinstance(value, dict):
+        return {k: finite(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [finite(v) for v in value]
+    return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
 def write_calibrated(path: Path, survey: Survey, made_by: Provenance) -> None:

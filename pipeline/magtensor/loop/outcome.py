@@ -9,8 +9,9 @@ import numpy as np
 from magtensor.loop.assessment import Colours, block_count
 from magtensor.loop.colour import Colour
 from magtensor.loop.evidence import grams
-from magtensor.loop.model import Record, State
-from magtensor.loop.search import Candidate, Search, put_back
+from magtensor.loop.model import Adopted, Record, State
+from magtensor.loop.search import Candidate, Search, Step, profiled, put_back
+from magtensor.loop.settings import Range
 from magtensor.loop.statistics import held_out_gain
 from magtensor.loop.terms import joined
 
@@ -34,10 +35,15 @@ def described(found: Search, record: Record, declared: int) -> dict[str, Any]:
     }
 
 
-def _step_of(found: Search, name: str, settings: Any) -> Candidate | None:
+def _step_of(found: Search, model: Adopted) -> Step | None:
+    """The round in which a model was adopted; its settings on a range were moved since."""
+    moved = {name for name, grid in profiled(model.component).items() if isinstance(grid, Range)}
+    fixed = {k: v for k, v in model.settings.items() if k not in moved}
     for step in found.steps:
-        if step.adopted is not None and step.adopted.model.name == name and step.adopted.model.settings == settings:
-            return step.adopted
+        if step.adopted is None or step.adopted.model.name != model.name:
+            continue
+        if all(step.adopted.model.settings.get(k) == v for k, v in fixed.items()):
+            return step
     return None
 
 
@@ -51,11 +57,9 @@ def _adopted(found: Search, index: int) -> dict[str, Any]:
     names, sensors = state.terms.names[part], state.terms.sensors[part]
     units = state.terms.units[part]
     before, after = removal(state, index)
-    step = _step_of(found, model.name, model.settings)
-    rivals = next(
-        (list(s.rivals) for s in found.steps if s.adopted is not None and s.adopted is step), []
-    )
-    p = step.assessment.p if step is not None else float("nan")
+    step = _step_of(found, model)
+    rivals = [] if step is None else list(step.rivals)
+    p = float("nan") if step is None or step.adopted is None else step.adopted.assessment.p
     return {
         "error_model": model.name,
         "kind": model.component.effect,
@@ -65,7 +69,7 @@ def _adopted(found: Search, index: int) -> dict[str, Any]:
             {"name": n, "sensor": s, "value": float(v), "std": float(d), "units": u}
             for n, s, v, d, u in zip(names, sensors, state.theta[index], std, units, strict=True)
         ],
-        "evidence": {"held_out_rms_before_nT": before, "held_out_rms_after_nT": after, "z": z_of(p), "p": p},
+        "evidence": {"held_out_rms_before_nT": before, "held_out_rms_after_nT": after, "z": z_of(p)},
         "indistinguishable_from": rivals,
     }
 
