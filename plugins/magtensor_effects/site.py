@@ -108,7 +108,9 @@ def _harmonic(name: str, places: Array) -> Array:
 def passing_source(
     x: Excitation,
     *,
-    time_s: Annotated[float, EventTimes(100), Field(description="when it is nearest, s since the survey's start")] = 0.0,
+    time_s: Annotated[
+        float, EventTimes(100), Field(description="when it is nearest, s since the survey's start")
+    ] = 0.0,
     passage_s: Annotated[
         float,
         Range(0.005, 0.1, count=3, spacing="log", of_duration=True),
