@@ -137,7 +137,7 @@ def _require(stage: PlannedStage, survey: Survey) -> None:
             raise DataError(
                 f"stage {stage.name} needs {need}, which this survey does not have",
                 where=str(survey.attributes.get("source", "")),
-                hint=f"it has {', '.join(survey.paths())}",
+                hint=f"it has {', '.join(p for p in survey.paths() if '/' not in p or p.startswith('reference/'))}",
             )
 
 

@@ -141,8 +141,7 @@ def canonical_unit(name: str) -> str:
         folded = {_ALIASES.get(u, u) for u in (*UNITS, *_ALIASES) if len(u) > 1 and u.lower() == text.lower()}
         if len(folded) == 1:
             return folded.pop()
-    known = [*UNITS, *_ALIASES]
-    raise UnitError(f"unknown unit '{name}'{did_you_mean(text, known)}; known are {', '.join(UNITS)}")
+    raise UnitError(f"unknown unit '{name}'{did_you_mean(text, [*UNITS, *_ALIASES])}")
 
 
 def is_unit(name: str) -> bool:
@@ -174,7 +173,12 @@ def convert(values: Any, units: str, to: str) -> NDArray[np.float64]:
     Raises:
         UnitError: an unknown unit, or two units of different dimensions.
     """
-    old_name, new_name = canonical_unit(units), canonical_unit(to)
+    new_name = canonical_unit(to)
+    try:
+        old_name = canonical_unit(units)
+    except UnitError as error:
+        fitting = [name for name, unit in UNITS.items() if unit.dimension == UNITS[new_name].dimension]
+        raise UnitError(f"{error}; {_article(UNITS[new_name].dimension)} may be in {', '.join(fitting)}") from None
     array = np.asarray(values, dtype=np.float64)
     if old_name == new_name:
         return array

@@ -69,8 +69,10 @@ def load(
         found = _only_window(found, window_s, where)
     if len(found.time) < 2:
         raise NotEnoughData("a single sample is no survey", where=where)
+    found, impossible = _without_impossible(found)
     _refuse_faults(found, magnitude, copied_axes, where)
-    good, flags = _flagged(found, saturation_nT, where)
+    _judge_position(found, magnitude, where, notes)
+    good, flags = _flagged(found, impossible, saturation_nT)
     share = 1.0 - good.mean(axis=0)
     for name, bad in zip(found.sensors, share, strict=True):
         if bad > max_flagged_share:
@@ -125,9 +127,12 @@ def _reference_times(survey: Survey, time_faults: str, where: str, notes: list[s
     if "reference/total_field" not in survey:
         return survey
     time = np.asarray(survey.values("reference/time"), dtype=np.float64)
-    known = np.isfinite(survey.values("reference/total_field"))
+    values = survey.values("reference/total_field")
+    known = np.isfinite(values)
     if not known.any():
         raise DataError("every value is missing", where=f"{where}: reference/total_field")
+    if np.median(values[known]) > 0:
+        known &= values > 0  # a proton magnetometer without a signal writes zero
     onward = checks.moves_on(time[known])
     if not onward.all():
         at = int(np.flatnonzero(known)[np.flatnonzero(~onward)[0]])
@@ -205,6 +210,8 @@ def _refuse_faults(survey: Survey, magnitude: str, copied_axes: str, where: str)
                 where=here,
                 hint="`load: {sensors: [...]}` can leave the sensor out",
             )
+    if magnitude == "refuse":
+        _refuse_magnitude(survey, where)
     for s, a in checks.deaf_axes(field):
         raise DataError(
             f"axis {AXES[a]} is dead: it varies a hundred times less than any direction of the other sensors",
@@ -218,8 +225,6 @@ def _refuse_faults(survey: Survey, magnitude: str, copied_axes: str, where: str)
                 where=f"{where}: b_raw",
                 hint="is one column mapped twice? `load: {copied_axes: accept}` lets it pass",
             )
-    if magnitude == "refuse":
-        _refuse_magnitude(survey, where)
 
 
 def _refuse_magnitude(survey: Survey, where: str) -> None:
@@ -244,24 +249,66 @@ def _refuse_magnitude(survey: Survey, where: str) -> None:
                 )
 
 
-def _flagged(survey: Survey, saturation_nT: float | None, where: str) -> tuple[NDArray[np.bool_], list[Flag]]:
+def _without_impossible(survey: Survey) -> tuple[Survey, dict[str, NDArray[np.bool_]]]:
+    """The survey with infinite and impossible values made missing, and where (N, S) they were, by reason.
+
+    They carry nothing that could be kept: one of them makes a mean or a square infinite.
+    """
+    field = survey.values("b_raw")
+    infinite, impossible = np.isinf(field), checks.impossible(field)
+    found = {"infinite value": infinite.any(axis=2), "impossible value": impossible.any(axis=2)}
+    if not (infinite.any() or impossible.any()):
+        return survey, found
+    values = np.where(infinite | impossible, np.nan, field)
+    return survey.merged({"b_raw": (("time", "sensor", "axis"), values, survey["b_raw"].attrs)}), found
+
+
+def _judge_position(survey: Survey, magnitude: str, where: str, notes: list[str]) -> None:
+    """Refuse positions farther apart than a rigid array is; note sensors that share a place."""
+    if "position" not in survey:
+        return
+    position = np.asarray(survey.values("position"), dtype=np.float64)
+    apart = np.linalg.norm(position[:, None] - position, axis=2)
+    if magnitude == "refuse" and np.nanmax(apart, initial=0.0) > checks.LARGEST_ARRAY_M:
+        raise DataError(
+            f"two sensors are {np.nanmax(apart):.4g} m apart, farther than in any rigid array",
+            where=f"{where}: position",
+            hint="are its units right (mm labelled m)? `load: {magnitude: accept}` lets it pass",
+        )
+    for s, t in zip(*np.nonzero(np.triu(apart == 0, 1)), strict=True):
+        notes.append(f"the sensors {survey.sensors[s]} and {survey.sensors[t]} are stated to be at one place")
+
+
+def _flagged(
+    survey: Survey, impossible: dict[str, NDArray[np.bool_]], saturation_nT: float | None
+) -> tuple[NDArray[np.bool_], list[Flag]]:
     """(N, S) usable samples, and the flags that say why the others are not."""
     field, time = survey.values("b_raw"), survey.time
     good = survey.good_by_sensor.copy()
     flags: list[Flag] = []
+    repeating = "the same numbers for longer than chance explains"
+    frozen = checks.frozen(field)
+    if frozen.any():
+        flags += flag_ranges(time, frozen, by=BY, reason="frozen: no sensor gives a new number")
+        good &= ~frozen[:, None]
     for s, name in enumerate(survey.sensors):
         own = field[:, s]
-        missing, infinite = np.asarray(np.isnan(own).any(axis=1)), np.asarray(np.isinf(own).any(axis=1))
+        known = {reason: where[:, s] for reason, where in impossible.items()}
+        missing = np.asarray(np.isnan(own).any(axis=1)) & ~np.any(list(known.values()), axis=0)
         rails = (np.abs(own) >= saturation_nT) if saturation_nT is not None else checks.saturated(own)
         others = np.delete(field, s, axis=1) if field.shape[1] > 1 else None
         for bad, reason in (
             (missing, "missing value"),
-            (infinite, "infinite value"),
+            *((bad, reason) for reason, bad in known.items()),
             (
                 np.asarray(rails.any(axis=1)),
                 f"saturated on axis {', '.join(AXES[a] for a in np.flatnonzero(rails.any(axis=0)))}",
             ),
-            (checks.stuck(own, others), "stuck: the same numbers for longer than chance explains"),
+            (checks.stuck(own, others), f"stuck: {repeating}"),
+            *(
+                (checks.stuck_axis(own, a, others) & ~rails[:, a], f"axis {axis} stuck: {repeating}")
+                for a, axis in enumerate(AXES)
+            ),
         ):
             flags += flag_ranges(time, bad, by=BY, reason=reason, sensor=name)
             good[:, s] &= ~bad

@@ -124,7 +124,7 @@ def test_sensor_names_have_a_default_and_other_groups_are_mentioned(tmp_path: Pa
         ({"b_raw": ((), np.zeros((60, 4, 3)), {})}, "b_raw: it has no units; nT is expected"),
         ({"b_raw": ((), np.zeros((60, 4, 3)), {"units": "V"})}, "b_raw: 'V' is a voltage"),
         ({"b_raw": ((), np.zeros((60, 4, 3)), {"units": "nanoT"})}, "b_raw: unknown unit 'nanoT'"),
-        ({"b_raw": ((), np.full((60, 4, 3), "x"), {"units": "nT"})}, "b_raw: values of type .* where numbers"),
+        ({"b_raw": ((), np.full((60, 4, 3), "x"), {"units": "nT"})}, "b_raw: it holds text; real numbers are needed"),
         ({"position": ((), np.zeros((3, 4)), {"units": "m"})}, r"position: shape \(3, 4\) is not \(sensor 4, axis 3\)"),
         ({"temperature": ((), np.zeros(17), {"units": "degC"})}, r"temperature: shape \(17,\) is not \(time 60\)"),
         ({"current_a": ((), np.zeros(60), {"units": "V"})}, "current_a: 'V' is a voltage, an electric current"),

@@ -222,7 +222,7 @@ def align(
     if len(b) < LEAST_SAMPLES:
         raise NotEnoughData(
             f"{len(b)} samples in which every sensor may be used cannot align them",
-            hint=f"at least {LEAST_SAMPLES} are needed; the flag record says which samples of which sensor were left out",
+            hint=f"at least {LEAST_SAMPLES} are needed that are flagged in no sensor and have a total field",
         )
     if len(calibrations) != sensors or not 0 <= reference < sensors:
         raise ValueError(f"{sensors} sensors, {len(calibrations)} calibrations, reference {reference}")

@@ -46,6 +46,7 @@ LEAST_RATIO = 10.0
 RESOLUTION = 1e-6  # of F: below this no sensor follows a quadric, so a smaller distance is no evidence
 WORST_ERROR = 0.05  # of F
 UNSEEN = 45.0  # deg: a half axis with no sample nearer counts as never seen
+SCATTERED = 0.5  # of the accepted error: samples so far from the surface are disturbed, whatever their attitudes
 SAME_ATTITUDE = 1e-3  # of F
 
 
@@ -102,7 +103,9 @@ class Coverage:
             )
         elif self.second_distance <= self.required_distance:
             found.append(
-                f"a second quadric surface passes within {self.second_distance:.3g} nT of the samples "
+                f"no ellipsoid comes nearer to the samples than {self.distance:.3g} nT rms"
+                if self.scattered
+                else f"a second quadric surface passes within {self.second_distance:.3g} nT of the samples "
                 f"(more than {self.required_distance:.3g} nT is needed to tell it from noise)"
             )
         elif self.worst_error > self.accepted_error:
@@ -111,6 +114,11 @@ class Coverage:
                 f"in some direction ({self.accepted_error:.3g} nT is accepted)"
             )
         return tuple(found)
+
+    @property
+    def scattered(self) -> bool:
+        """Whether the samples lie so far from any ellipsoid that their attitudes cannot be judged."""
+        return self.distance > SCATTERED * self.accepted_error
 
     @property
     def determined(self) -> bool:
@@ -187,6 +195,11 @@ def require_coverage(found: Coverage) -> None:
     """
     if found.determined:
         return
+    if found.scattered and found.distinct >= 9:
+        raise NotEnoughData(
+            f"{'; '.join(found.faults)}, so they determine no scale factors, angles and offsets",
+            hint="look for spikes, stuck or saturated values, the wrong reference, or a moving magnetic object",
+        )
     missing = f": {found.missing}" if found.missing else ""
     raise NotEnoughData(
         f"the attitudes do not determine scale factors, angles and offsets: {'; '.join(found.faults)}; "

@@ -32,6 +32,7 @@ LAYOUT: dict[str, tuple[tuple[tuple[str, ...], ...], str | None]] = {
     "segment": ((("time",),), None),
 }
 _CURRENT = ((("time",),), "A")
+RESULTS = ("good", "total_field", "total_field_std", "diurnal")  # what stages give; no channel may have these names
 LENGTHS = {"axis": 3, "quaternion": 4}
 
 
@@ -74,6 +75,8 @@ def survey_from(tables: Tables) -> Survey:
             where=raw.origin,
             hint="one sensor has the shape (time, 1, 3); for any other layout write a mapping in the recipe",
         )
+    if 0 in raw.shape:
+        raise DataError("it holds no sample" if raw.shape[1] else "it holds no sensor", where=raw.origin)
     sizes = {"time": len(time), "sensor": raw.shape[1], **LENGTHS}
     variables: dict[str, Any] = {
         "time": (("time",), time, {**tables.find("time").attributes, "units": since(epoch)}),
@@ -133,10 +136,18 @@ def _names(tables: Tables, count: int) -> NDArray[Any]:
         return np.array([f"S{i + 1}" for i in range(count)])
     column = tables.find("sensor")
     if column.shape != (count,):
-        raise DataError(f"{column.shape} sensor names, but b_raw has {count} sensors", where=column.origin)
+        given = column.shape[0] if len(column.shape) == 1 else f"an array of shape {column.shape} of"
+        raise DataError(f"{given} sensor names, but b_raw has {count} sensors", where=column.origin)
     values = column.load()
     names = [str(v) if values.dtype.kind in "OSU" else f"S{v}" for v in values.tolist()]
-    if len(set(names)) < count or not all(names):
+    for i, name in enumerate(names):
+        if not name.strip() or not name.isprintable():
+            raise DataError(
+                f"the name {name!r} of sensor {i + 1} is empty or cannot be printed",
+                where=column.origin,
+                hint="a name is one line of printable characters",
+            )
+    if len(set(names)) < count:
         raise DataError(f"sensor names {', '.join(names)} are not unique", where=column.origin)
     return np.array(names)
 
@@ -157,7 +168,9 @@ def _axes(tables: Tables) -> NDArray[Any]:
 
 def _numeric(values: NDArray[Any], column: Column) -> None:
     if values.dtype.kind not in "fiub":
-        raise DataError(f"values of type {values.dtype} where numbers are needed", where=column.origin)
+        kinds = {"c": "complex numbers", "U": "text", "S": "text", "O": "text", "M": "dates", "V": "records"}
+        held = kinds.get(values.dtype.kind, "no numbers")
+        raise DataError(f"it holds {held}; real numbers are needed", where=column.origin)
 
 
 def _dims(name: str, column: Column, sizes: Mapping[str, int], notes: list[str]) -> tuple[str, ...] | None:
@@ -184,7 +197,7 @@ def _dims(name: str, column: Column, sizes: Mapping[str, int], notes: list[str])
 
 def _variable(name: str, column: Column, sizes: Mapping[str, int], notes: list[str]) -> Any:
     known = expected(name)
-    if known is None and column.text:
+    if known is None and (column.text or name in RESULTS):
         return None
     dims = _dims(name, column, sizes, notes)
     if dims is None:
@@ -206,12 +219,12 @@ def _variable(name: str, column: Column, sizes: Mapping[str, int], notes: list[s
 
 
 def _converted(values: NDArray[Any], column: Column, units: str) -> NDArray[np.float64]:
-    if column.units is None:
+    if not (column.units or "").strip():
         raise DataError(
             f"it has no units; {units} is expected", where=column.origin, hint=f"set its units attribute to {units}"
         )
     try:
-        return convert(values, column.units, units)
+        return convert(values, str(column.units), units)
     except UnitError as error:
         raise DataError(str(error), where=column.origin) from error
 

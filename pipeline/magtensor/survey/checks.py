@@ -17,6 +17,8 @@ Bools = NDArray[np.bool_]
 # sensor shows, at 31 km height it is 1.5 % less. Half and twice are far from every factor between two units.
 EARTH_FIELD_NT = (22_000.0, 67_000.0)
 MARGIN = 2.0
+LARGEST_ARRAY_M = 100.0
+IMPOSSIBLE = 1e3  # times a sensor's median magnitude: no range reaches so far beyond what it measures
 LOOKED_AT = 200_000  # samples; a step shows in these as in ten million
 # What a number that was labelled nT may have been, with the factor that makes nT of it.
 RIVALS = (
@@ -150,7 +152,7 @@ def stuck(field: Floats, others: Floats | None = None) -> Bools:
     99 % of all steps, or that it never ends.
 
     Args:
-        field: (N, 3) nT.
+        field: (N, 3) nT, or more columns.
         others: (N, K, 3) nT; None where there is no other sensor.
     """
     found = np.zeros(len(field), dtype=bool)
@@ -166,7 +168,8 @@ def stuck(field: Floats, others: Floats | None = None) -> Bools:
     steps = np.nan_to_num(np.linalg.norm(np.diff(field, axis=0), axis=1))
     moving = steps[steps > 0]
     usual = float(np.percentile(moving, 99)) if moving.size else 0.0
-    enough = 10 * max(max(resolution(field[:, a]) for a in range(3)), 0.0 if others is None else _noise(others))
+    step = max(resolution(column) for column in field.T)
+    enough = 10 * max(step, 0.0 if others is None else _noise(others))
     for start, length in zip(starts, lengths, strict=True):
         if length <= believable:
             continue
@@ -175,6 +178,73 @@ def stuck(field: Floats, others: Floats | None = None) -> Bools:
             found[start:stop] |= _span(others[start:stop]) > enough
         else:
             found[start:stop] |= stop == len(field) or steps[stop - 1] > usual
+    return found
+
+
+def stuck_axis(field: Floats, axis: int, others: Floats | None = None) -> Bools:
+    """(N,) True where one axis repeats itself while its sensor goes on.
+
+    The witnesses are the other axes of the sensor; and, because a turn about an axis leaves its output alone, the
+    other sensors, all of which must have seen the field move out of any plane.
+
+    Args:
+        field: (N, 3) nT.
+        axis: which.
+        others: (N, K, 3) nT; None where there is no other sensor.
+    """
+    found = np.zeros(len(field), dtype=bool)
+    values, own = field[:, axis], np.delete(field, axis, axis=1)
+    starts, lengths = runs(values[1:] == values[:-1])
+    if len(field) < 20 or len(starts) == 0:
+        return found
+    longest = int(lengths.max())
+    repeats = (values[1:] == values[:-1]).sum() - (longest - 1)
+    believable = believable_run(len(field), repeats / max(len(field) - longest, 1))
+    suspect = lengths > believable
+    if not suspect.any():
+        return found
+    step = max(resolution(values), 0.0 if others is None else _noise(others))
+    for start, length in zip(starts[suspect], lengths[suspect], strict=True):
+        part = slice(start, start + length)
+        if _span(own[part]) <= 20 * step or not (np.diff(own[part], axis=0) != 0).any():
+            continue
+        found[part] |= others is None or _thickness(others[part]) > 20 * step
+    return found
+
+
+def _thickness(field: Floats) -> float:
+    """Standard deviation of the field (N, K, 3) along its weakest direction, nT; the sensor where it is least."""
+    whole = field[np.isfinite(field).all(axis=(1, 2))]
+    if len(whole) < 4:
+        return 0.0
+    centred = (whole - whole.mean(axis=0)).transpose(1, 0, 2)
+    return float(np.linalg.svd(centred, compute_uv=False)[:, -1].min() / np.sqrt(len(whole)))
+
+
+def frozen(field: Floats) -> Bools:
+    """(N,) True where all sensors repeat all their numbers for longer than chance explains: the recorder hangs.
+
+    Nothing is left as a witness that the platform moved, so a run counts if it ends in a larger jump than 99 % of
+    all steps, or with the record.
+
+    Args:
+        field: (N, S, 3) nT.
+    """
+    return stuck(field.reshape(len(field), -1)) if field.shape[1] > 1 else np.zeros(len(field), dtype=bool)
+
+
+def impossible(field: Floats) -> Bools:
+    """(N, S, 3) True where a value is `IMPOSSIBLE` times as large as the sensor's median magnitude.
+
+    Args:
+        field: (N, S, 3) nT.
+    """
+    size = np.abs(np.where(np.isfinite(field), field, np.nan))
+    found = np.zeros(field.shape, dtype=bool)
+    for s in range(field.shape[1]):
+        whole = size[np.isfinite(size[:, s]).all(axis=1), s]
+        if len(whole):
+            found[:, s] = size[:, s] > IMPOSSIBLE * float(np.median(whole.max(axis=1)))
     return found
 
 
