@@ -115,7 +115,7 @@ def _table_2(found: dict[int, dict[str, Array]], runs: int) -> Comparison:
         ]
     for height in (40, 20):
         rows.append(row(f"before, {height} m", found[height]["before"], printed.SUI_BEFORE, why={EVERY: NEARER}))
-    rows.append(Row("noise alone", FIVE, found[HEIGHTS[0]]["floor"], decimals=2))
+    rows.append(Row("noise alone", FIVE, found[HEIGHTS[0]]["floor"][:1], decimals=2))
     return Comparison(
         "Sui 2017, Table 2: tensor errors in nT/m",
         f"{runs} instruments, each turned 500 times, straight above the dipole; recipe `sui2017.yaml`. The "
