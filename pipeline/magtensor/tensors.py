@@ -32,16 +32,19 @@ def assembly_variables(assembly: Assembly, position: Array, noise: Array) -> dic
         "notes": json.dumps(list(assembly.notes)),
         "long_name": "tensor = gain : b",
     }
-    return {
+    return noise_variables(noise) | {
         "calibration/row": (("row",), np.array(AXES), {}),
         "calibration/column": (("column",), np.array(AXES), {}),
         "calibration/tensor_gain": (("row", "column", "sensor", "axis"), assembly.gain, facts),
         "calibration/field_gain": (("row", "sensor", "axis"), assembly.field_gain, {"units": "1"}),
-        "calibration/noise_std": (
-            ("sensor", "axis"), noise, {"units": "nT", "long_name": "white noise of b, from second differences"},
-        ),
         "calibration/position": (("sensor", "axis"), position, {"units": "m"}),
     }  # fmt: skip
+
+
+def noise_variables(noise: Array) -> dict[str, Variable]:
+    """`calibration/noise_std`."""
+    attributes = {"units": "nT", "long_name": "white noise of b, from second differences"}
+    return {"calibration/noise_std": (("sensor", "axis"), noise, attributes)}
 
 
 def stored_assembly(calibration: Survey) -> Assembly:

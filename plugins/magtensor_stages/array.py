@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 from pydantic import Field
 
-from magtensor import DataError, MethodChoice, stage
+from magtensor import DataError, MethodChoice, NotEnoughData, stage
 from magtensor.calibrated import restored
 from magtensor.calibration.types import PARAMETERS_PER_SENSOR, SensorCalibration
+from magtensor.components import Declares
 from magtensor.errors import did_you_mean
 from magtensor_stages.sensors import common_frame, naming
 
@@ -64,37 +66,58 @@ def align(
     return common_frame(survey, aligned, method.__name__)
 
 
-@stage(
-    needs=(
-        "calibrated/b", "position", "calibration/rotation", "calibration/matrix", "calibration/offset",
-        "calibration/covariance",
-    ),
-    uses=("total_field",),
-    gives=(
-        "calibrated/tensor", "calibrated/tensor_std", "calibrated/mean_field", "calibrated/invariants",
-        "calibrated/invariants_std", "calibration/tensor_gain", "calibration/field_gain", "calibration/noise_std",
-        "calibration/position",
-    ),
-    may_give=(
-        "residual/closure", "residual/identity", "calibrated/row", "calibrated/column", "calibrated/invariant",
-        "calibration/row", "calibration/column",
-    ),
+CALIBRATED = (
+    "calibrated/b", "calibration/rotation", "calibration/matrix", "calibration/offset", "calibration/covariance",
 )  # fmt: skip
-def assemble_tensor(survey: Survey, *, method: MethodChoice = "least_squares") -> dict[str, Any]:
+TENSOR = (
+    "calibrated/tensor", "calibrated/tensor_std", "calibrated/mean_field", "calibrated/invariants",
+    "calibrated/invariants_std", "calibration/tensor_gain", "calibration/field_gain", "calibration/position",
+)  # fmt: skip
+BESIDE_TENSOR = (
+    "residual/closure", "residual/identity", "calibrated/row", "calibrated/column", "calibrated/invariant",
+    "calibration/row", "calibration/column",
+)  # fmt: skip
+
+
+def touched_by_assembly(options: Mapping[str, Any]) -> Declares:
+    """A tensor that is required needs positions; one that is not may stay away."""
+    if options.get("required", True):
+        return Declares(
+            (*CALIBRATED, "position"), ("total_field",), (*TENSOR, "calibration/noise_std"), BESIDE_TENSOR
+        )
+    return Declares(CALIBRATED, ("total_field", "position"), ("calibration/noise_std",), (*TENSOR, *BESIDE_TENSOR))
+
+
+@stage(declares=touched_by_assembly)
+def assemble_tensor(
+    survey: Survey,
+    *,
+    method: MethodChoice = "least_squares",
+    required: Annotated[
+        bool, Field(description="refuse an array that cannot measure a tensor; false goes on without one")
+    ] = True,
+) -> dict[str, Any]:
     """Assemble the gradient tensor, its standard deviation and its invariants from the calibrated sensors.
 
     A method is ``f(position (S, 3) m, noise_covariance (3 S, 3 S) nT^2 or None, *, options) -> Assembly``. The
     standard deviation holds the sensors' noise and the uncertainty of the calibration.
     """
     from magtensor.calibration.noise import noise_std
-    from magtensor.tensors import assembled, assembly_variables
+    from magtensor.tensors import assembled, assembly_variables, noise_variables
 
     b = survey.values("calibrated/b")
-    position = np.asarray(survey.values("position"), dtype=float)
     good = survey.good & np.isfinite(b).all(axis=(1, 2))
     total_field = survey.values("total_field") if "total_field" in survey else None
     noise = noise_std(b[good], None if total_field is None else total_field[good])
     known = bool(np.isfinite(noise).all() and (noise > 0).all())
-    with naming(survey):
-        assembly = method(position, np.diag(noise.ravel() ** 2) if known else None)
+    if not required and "position" not in survey:
+        return noise_variables(noise)
+    position = np.asarray(survey.values("position"), dtype=float)
+    try:
+        with naming(survey):
+            assembly = method(position, np.diag(noise.ravel() ** 2) if known else None)
+    except NotEnoughData:
+        if required:
+            raise
+        return noise_variables(noise)
     return assembly_variables(assembly, position, noise) | assembled(assembly, b, position, noise, restored(survey))

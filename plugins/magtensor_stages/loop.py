@@ -61,7 +61,10 @@ def close_loop(
     first, last = found.first, found.last
     raw, field = without(record, [a.terms(last.excitation) for a in last.adopted], last.theta)
     calibration = calibrated(last.fit, field, raw, reference_noise_nT)
-    outcome = {"declared": ["linear", *(a.name for a in begin)]} | described(found, record, len(begin))
+    outcome = {
+        "declared": ["linear", *(a.name for a in begin)],
+        "noise_floor_nT": float(last.residual.scale),
+    } | described(found, record, len(begin))
     outcome["unexplained"] = unexplained(found, record)
     keep = last.fit.keep
     before = held_out_error(record, begin, how, first.theta, keep)

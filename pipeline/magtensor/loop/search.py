@@ -8,7 +8,7 @@ contiguous folds. Rivals that do as well on this survey are named, and the simpl
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -19,8 +19,10 @@ from magtensor.loop.assessment import Assessment, Colours, assess, estimated, ex
 from magtensor.loop.colour import Colour
 from magtensor.loop.excitation import Excitation
 from magtensor.loop.model import Adopted, Fitting, Record, State, joint_state
+from magtensor.loop.needs import missing
 from magtensor.loop.residual import Residual
-from magtensor.loop.settings import Range
+from magtensor.loop.settings import EventTimes, Range
+from magtensor.loop.spectrum import spectral_lines
 from magtensor.loop.statistics import Gain, family_p, held_out_gain
 from magtensor.loop.terms import Terms, joined
 
@@ -123,11 +125,14 @@ def search(
     alpha: family-wise false-alarm probability of the first gate.
     say: called with a line about each round.
     """
-    testable, not_tested = _testable(record, models)
     state = first = joint_state(record, declared, how)
+    testable, not_tested = _testable(first.excitation, models)
     steps: list[Step] = []
     failed: dict[str, str] = {}
-    for _ in range(most_effects):
+    for _ in range(most_effects + 1):
+        state = with_lines(state, record)
+        if len(state.adopted) - len(declared) >= most_effects:
+            break
         taken = {a.name for a in state.adopted}
         open_ = [m for m in testable if m.name not in taken or _repeatable(m)]
         candidates = _candidates(record, state, open_, failed, alpha)
@@ -148,37 +153,15 @@ def search(
     return Search(first, state, tuple(steps), not_tested, failed)
 
 
-def _testable(record: Record, models: Sequence[Component]) -> tuple[list[Component], dict[str, tuple[str, ...]]]:
+def _testable(x: Excitation, models: Sequence[Component]) -> tuple[list[Component], dict[str, tuple[str, ...]]]:
     """The models whose channels exist, and what the others miss."""
-    from fnmatch import fnmatchcase
-
-    have = set(record.logged) | {"time"}
-    if record.attitude is not None:
-        have.add("attitude")
-    if record.position is not None:
-        have.add("position")
-    if record.total_field is not None:
-        have.add("total_field")
-    lengths = np.bincount(record.run)
-    if np.median(lengths[record.run]) >= 5:
-        have.add("rotation")
-    found, missing = [], {}
-    for model in models:
-        lacks = tuple(
-            need
-            for need in model.declared({}).needs
-            if not any(any(fnmatchcase(h, one) for one in need.split("|")) for h in have)
-        )
-        if lacks:
-            missing[model.name] = lacks
-        else:
-            found.append(model)
-    return found, missing
+    lacking = {model.name: tuple(missing(model, x)) for model in models}
+    return [m for m in models if not lacking[m.name]], {name: lacks for name, lacks in lacking.items() if lacks}
 
 
 def _repeatable(model: Component) -> bool:
     """A model that can be adopted more than once, with other settings: one that chooses a channel, time or line."""
-    from magtensor.loop.settings import AnyChannel, EventTimes, Frequencies
+    from magtensor.loop.settings import AnyChannel, Frequencies
 
     return any(isinstance(g, (AnyChannel, EventTimes, Frequencies)) for g in profiled(model).values())
 
@@ -296,7 +279,7 @@ def _refined(
     """Settings on a range, moved between the neighbours of the best grid value by golden section."""
     tried = 0
     for name, grid in profiled(model).items():
-        if not isinstance(grid, Range):
+        if not isinstance(grid, (Range, EventTimes)):
             continue
         values = sorted(grid.values(state.excitation))
         place = int(np.argmin(np.abs(np.array(values) - settings[name])))
@@ -409,6 +392,12 @@ def _polished(record: Record, state: State, how: Fitting) -> State:
                 models = [changed if i == number else a for i, a in enumerate(state.adopted)]
                 state = joint_state(record, models, how, state.theta)
     return state
+
+
+def with_lines(state: State, record: Record) -> State:
+    """The state, its excitation knowing the strongest lines in the spectrum of what is left."""
+    lines = tuple(f for f, _, _ in spectral_lines(state.residual, record.time[state.residual.samples]))
+    return replace(state, excitation=replace(state.excitation, lines=lines))
 
 
 def _slices(state: State) -> list[slice]:

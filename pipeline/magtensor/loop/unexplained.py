@@ -16,6 +16,7 @@ import numpy as np
 from magtensor.calibration.types import Array
 from magtensor.loop.model import Record, State
 from magtensor.loop.search import Candidate, Search
+from magtensor.loop.spectrum import spectral_lines
 
 ALPHA = 0.005  # of each of the tests
 SURROGATES = 199
@@ -104,50 +105,8 @@ def _leading(slow: Array) -> float:
 
 def strongest_line(state: State, record: Record) -> tuple[float, float] | None:
     """Frequency in Hz and rms in nT of a spectral line that noise does not make; None without one."""
-    lines = spectral_lines(state, record)
+    lines = spectral_lines(state.residual, record.time[state.residual.samples])
     return (lines[0][0], lines[0][1]) if lines and lines[0][2] < ALPHA else None
-
-
-def spectral_lines(state: State, record: Record, most: int = 5) -> list[tuple[float, float, float]]:
-    """(frequency Hz, rms nT, p) of the strongest peaks of the residual over its smooth spectrum.
-
-    The residual is multiplied by each of (1, direction), because a line of the platform shows unturned.
-    """
-    from scipy.fft import rfft
-    from scipy.stats import chi2
-
-    residual = state.residual
-    time = record.time[residual.samples]
-    if len(time) < 256 or residual.across is None:
-        return []
-    step = np.median(np.diff(time))
-    if np.max(np.abs(np.diff(time) - step)) > 0.5 * step:
-        return []
-    values, vectors = np.linalg.eigh(residual.projector)
-    coordinates = residual.across @ vectors[:, values > 0.5]
-    n, k = coordinates.shape
-    power = np.sum(np.abs(rfft(coordinates, axis=0)) ** 2, axis=1)[1:] / n
-    frequency = np.arange(1, len(power) + 1) / (n * step)
-    smooth = _running_median(power, max(len(power) // 100, 15))
-    ratio = power / np.maximum(smooth, 1e-300) * chi2.median(2 * k) / 2.0  # to the scale of k exponentials' sum
-    order = np.argsort(-ratio)
-    peaks: list[tuple[float, float, float]] = []
-    for i in order:
-        if len(peaks) == most:
-            break
-        if any(abs(frequency[i] - f) < 3.0 / (n * step) for f, _, _ in peaks):
-            continue
-        p = min(1.0, float(chi2.sf(2.0 * ratio[i], 2 * k)) * len(power))
-        amplitude = float(np.sqrt(2.0 * power[i] / n / k) * residual.scale)
-        peaks.append((float(frequency[i]), amplitude, p))
-    return peaks
-
-
-def _running_median(values: Array, width: int) -> Array:
-    from scipy.ndimage import median_filter
-
-    out: Array = median_filter(values, size=2 * width + 1, mode="nearest")
-    return out
 
 
 def _sensors(state: State) -> str:

@@ -1,0 +1,51 @@
+"""Lines in the spectrum of a residual."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from magtensor.calibration.types import Array
+from magtensor.loop.residual import Residual
+
+
+def spectral_lines(residual: Residual, time: Array, most: int = 5) -> list[tuple[float, float, float]]:
+    """(frequency Hz, rms nT, p) of the strongest peaks of the residual across over its smooth spectrum.
+
+    p is that of the largest of all peaks under noise without lines. The lowest frequencies, where no smooth spectrum
+    can be told from a line, are left out; so are surveys that are not evenly sampled.
+    """
+    from scipy.fft import rfft
+    from scipy.stats import chi2
+
+    if len(time) < 256 or residual.across is None:
+        return []
+    step = np.median(np.diff(time))
+    if np.max(np.abs(np.diff(time) - step)) > 0.5 * step:
+        return []
+    values, vectors = np.linalg.eigh(residual.projector)
+    coordinates = residual.across @ vectors[:, values > 0.5]
+    n, k = coordinates.shape
+    power = np.sum(np.abs(rfft(coordinates, axis=0)) ** 2, axis=1)[1:] / n
+    frequency = np.arange(1, len(power) + 1) / (n * step)
+    width = max(len(power) // 100, 15)
+    smooth = _running_median(power, width)
+    ratio = power / np.maximum(smooth, 1e-300) * chi2.median(2 * k) / 2.0  # to the scale of k exponentials' sum
+    ratio[: 2 * width] = 0.0
+    order = np.argsort(-ratio)
+    peaks: list[tuple[float, float, float]] = []
+    for i in order:
+        if len(peaks) == most:
+            break
+        if any(abs(frequency[i] - f) < 3.0 / (n * step) for f, _, _ in peaks):
+            continue
+        p = min(1.0, float(chi2.sf(2.0 * ratio[i], 2 * k)) * len(power))
+        amplitude = float(np.sqrt(2.0 * power[i] / n / k) * residual.scale)
+        peaks.append((float(frequency[i]), amplitude, p))
+    return peaks
+
+
+def _running_median(values: Array, width: int) -> Array:
+    from scipy.ndimage import median_filter
+
+    out: Array = median_filter(values, size=2 * width + 1, mode="nearest")
+    return out
