@@ -43,7 +43,7 @@ def close_loop(
     """
     from magtensor.calibration.joint import calibrated
     from magtensor.loop.errors_before_after import held_out_error
-    from magtensor.loop.model import Adopted, Fitting, without
+    from magtensor.loop.model import Adopted, Fitting, require_determined, without
     from magtensor.loop.outcome import described
     from magtensor.loop.record import record_of
     from magtensor.loop.search import search as find
@@ -59,6 +59,7 @@ def close_loop(
     models = [component for name, (component, _) in dict(search or {}).items() if name not in names]
     found = find(record, models, how, declared=begin, most_effects=most_effects, alpha=false_alarm)
     first, last = found.first, found.last
+    require_determined(record, last, how)
     raw, field = without(record, [a.terms(last.excitation) for a in last.adopted], last.theta)
     calibration = calibrated(last.fit, field, raw, reference_noise_nT)
     outcome = {

@@ -145,6 +145,7 @@ def coverage(
     matrix: Array | None = None,
     offset: Array | None = None,
     worst_error: float = WORST_ERROR,
+    noise: float | None = None,
 ) -> Coverage:
     """Judge the attitudes of one sensor, with the fit where there is one.
 
@@ -154,13 +155,16 @@ def coverage(
     total_field: (N,) nT, positive.
     matrix, offset: the fitted correction b = matrix @ (m - offset); without them only the quadrics are judged.
     worst_error: accepted error of |b| in the worst direction, as a fraction of F.
+    noise: nT, of the samples, where it is known otherwise than by their distance to the surface: a misfit that the
+        model has yet to explain is then not taken for it.
     """
     field = float(np.mean(total_field))
     centre = np.zeros(3) if offset is None else offset
     points = (centre + (raw - centre) * (field / total_field)[:, None]) / field
     nearest = nearest_quadrics(points)
     first, second = (float(d) for d in nearest.distance[:2])
-    noise = max(first * np.sqrt(len(raw) / max(len(raw) - 9, 1)), RESOLUTION)
+    found = first * np.sqrt(len(raw) / max(len(raw) - 9, 1))
+    level = max(found if noise is None else min(found, noise / field), RESOLUTION)
     directions = _directions(points, centre / field)
     worst = float("nan")
     condition = _condition(_attitude_design(directions))
@@ -177,7 +181,7 @@ def coverage(
         condition_number=condition,
         distance=first * field,
         second_distance=second * field,
-        required_distance=_required_ratio(len(raw)) * noise * field,
+        required_distance=_required_ratio(len(raw)) * level * field,
         worst_error=worst,
         accepted_error=worst_error * field,
         empty_cones=_empty_cones(thinned),

@@ -22,11 +22,13 @@ from .axes import mirrored_words, turned_words
 from .common_field import CommonField, common_field, output_noise
 from .coverage import WORST_ERROR, coverage, require_coverage
 from .maximum_likelihood import ScalarFit, fit_scalar
+from .noise import noise_std, shares_of_two
 from .scalar import checked_samples
 from .types import Array, ArrayCalibration
 
 FALSE_REJECTION = 0.01  # probability that one clean sample of the whole survey is rejected
 LEAST_FOR_REJECTION = 50  # with fewer samples the fit bends to an outlier, and no residual can tell which it was
+_TOLD_APART = 2  # rounds after which the noise of two sensors no longer moves
 _CHUNK = 65536
 
 
@@ -56,6 +58,7 @@ def fit_joint(
     robust: bool = True,
     worst_error: float = WORST_ERROR,
     keep: NDArray[np.bool_] | None = None,
+    complete: bool = True,
 ) -> JointFit:
     """Fit C and o of all sensors to their outputs and the total field.
 
@@ -68,6 +71,8 @@ def fit_joint(
     robust: leave out samples that no noise explains.
     worst_error: see `coverage.coverage`.
     keep: (N,) the samples to believe; judged here when None.
+    complete: the model is believed to hold all there is, so that a misfit is noise. Where it is not, an effect that no
+        one has added yet must not pass for a lack of attitudes.
 
     Raises
     ------
@@ -79,7 +84,8 @@ def fit_joint(
     keep = np.ones(len(raw), dtype=bool) if keep is None else keep
     sensors = raw.shape[1]
     given = output_noise(raw) if noise is None and sensors > 1 and len(raw) >= LEAST_FOR_REJECTION else noise
-    for _ in range(20):
+    two = sensors == 2 and noise is None and given is not None
+    for round_ in range(20):
         plane = common_field(raw, given, keep)
         y = plane.coordinates(raw)
         try:
@@ -93,6 +99,9 @@ def fit_joint(
             plane = common_field(raw, given, keep)
             y = plane.coordinates(raw)
             scalar = fit_scalar(y[keep], total_field[keep], reference_noise)
+        if two and round_ < _TOLD_APART:
+            given = _told_apart(given, _unfold(plane, scalar, sensors), raw, total_field)
+            continue
         if not judge:
             break
         again = _believable(plane, scalar, raw, total_field, reference_noise, keep)
@@ -109,10 +118,21 @@ def fit_joint(
     forward, offset = _unfold(plane, scalar, sensors)
     # judged on the calibrated field, whose axes are nearest to those of the sensors
     field = (y[keep] - scalar.offset) @ scalar.matrix.T @ nearest_frame(forward)
-    seen = coverage(field, total_field[keep], matrix=np.eye(3), offset=np.zeros(3), worst_error=worst_error)
-    require_coverage(seen)
+    reference = total_field[keep]
+    level = None if complete else float(noise_std(field[:, None], reference)[0, 0])
+    require_coverage(
+        coverage(field, reference, matrix=np.eye(3), offset=np.zeros(3), worst_error=worst_error, noise=level)
+    )
     _refuse_sensors(forward, offset, raw[keep], total_field[keep])
     return JointFit(forward, offset, plane, scalar, keep)
+
+
+def _told_apart(noise: Array, found: tuple[Array, Array], raw: Array, total_field: Array) -> Array:
+    """(2, 3) nT: the noise that two sensors' contrast shows, given to each as the total field tells them apart."""
+    forward, offset = found
+    b = np.einsum("sij,nsj->nsi", np.linalg.pinv(forward, rcond=1e-9), raw - offset)
+    out: Array = np.sqrt(np.sum(noise**2, axis=0) * shares_of_two(b, total_field)[:, None])
+    return out
 
 
 def _refuse_sensors(forward: Array, offset: Array, raw: Array, total_field: Array) -> None:

@@ -7,6 +7,7 @@ import numpy as np
 from magtensor.calibration.types import Array
 
 MAD_TO_SIGMA = 1.482602218505602  # for a normal distribution
+LEAST_SHARE = 0.02  # of the noise variance of two sensors, that the quieter one is believed to have
 
 
 def noise_std(b: Array, total_field: Array | None = None) -> Array:
@@ -18,8 +19,8 @@ def noise_std(b: Array, total_field: Array | None = None) -> Array:
 
     Args:
         b: (N, S, 3) nT, calibrated to one frame, samples in order.
-        total_field: (N,) nT, the reference; needed for a single sensor only, where |b| - F gives the noise
-            along the field and the three axes are taken as equal.
+        total_field: (N,) nT, the reference. One sensor needs it: |b| - F gives the noise along the field, and the
+            three axes are taken as equal. For two sensors it tells whose the noise of their only contrast is.
 
     Returns:
         (S, 3) nT; NaN where fewer than four samples, or nothing to compare with, leave it open.
@@ -33,13 +34,38 @@ def noise_std(b: Array, total_field: Array | None = None) -> Array:
         return np.full((1, 3), _second_difference_std(along[:, None])[0])
     contrasts = b - b.mean(axis=1, keepdims=True)
     variance = _second_difference_std(contrasts.reshape(n, -1)).reshape(sensors, 3) ** 2
-    if sensors == 2:  # the two contrasts are one and the same: share the variance equally
-        return np.sqrt(2.0 * variance)
+    if sensors == 2:  # the two contrasts are one and the same
+        share = np.full(2, 0.5) if total_field is None else shares_of_two(b, total_field)
+        return np.sqrt(4.0 * variance * share[:, None])
     # var(contrast_s) = (1 - 2/S) v_s + sum(v) / S^2 and sum over s gives sum(v) (1 - 1/S)
     total = variance.sum(axis=0) / (1.0 - 1.0 / sensors)
     own = (variance - total / sensors**2) / (1.0 - 2.0 / sensors)
     # a sensor much quieter than its neighbours may come out below zero by chance
     return np.sqrt(np.maximum(own, 0.01 * total / sensors))
+
+
+def shares_of_two(b: Array, total_field: Array) -> Array:
+    """Which part of the noise variance of two sensors' contrast each of them has.
+
+    The contrast itself does not tell. |b_s| - F does: the second differences of the two have the reference's noise in
+    common, and nothing else.
+
+    Args:
+        b: (N, 2, 3) nT, calibrated, samples in order.
+        total_field: (N,) nT.
+
+    Returns:
+        (2,) shares, of sum 1.
+    """
+    along = np.linalg.norm(b, axis=2) - total_field[:, None]
+    each = _second_difference_std(along) ** 2
+    sums = _second_difference_std(np.column_stack([along.sum(axis=1), along[:, 0] - along[:, 1]])) ** 2
+    own = each - max((sums[0] - sums[1]) / 4.0, 0.0)
+    if not own.sum() > 0:
+        return np.full(2, 0.5)
+    own = np.maximum(own, LEAST_SHARE * each.sum())
+    shares: Array = own / own.sum()
+    return shares
 
 
 def _second_difference_std(series: Array) -> Array:

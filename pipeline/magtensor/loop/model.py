@@ -158,11 +158,13 @@ class Fitting:
         reference_noise: nT, of the total field.
         worst_error: accepted predicted error of |b|, a fraction of F.
         noise: (S, 3) nT or None.
+        complete: whether what the fit leaves is noise; while effects are still being searched it is not.
     """
 
     reference_noise: float = 0.0
     worst_error: float = 0.05
     noise: Array | None = None
+    complete: bool = False
 
 
 def joint_state(
@@ -220,8 +222,20 @@ def joint_state(
 def _fit(raw: Array, reference: Array | None, how: Fitting, keep: NDArray[np.bool_] | None) -> JointFit:
     assert reference is not None
     return fit_joint(
-        raw, reference, noise=how.noise, reference_noise=how.reference_noise, worst_error=how.worst_error, keep=keep
-    )
+        raw, reference, noise=how.noise, reference_noise=how.reference_noise, worst_error=how.worst_error, keep=keep,
+        complete=how.complete,
+    )  # fmt: skip
+
+
+def require_determined(record: Record, state: State, how: Fitting) -> None:
+    """Refuse a calibration whose attitudes, with all that was adopted, do not determine C and o.
+
+    Raises
+    ------
+    NotEnoughData: as in `fit_joint`.
+    """
+    raw, reference = without(record, [a.terms(state.excitation) for a in state.adopted], state.theta)
+    _fit(raw, reference, replace(how, complete=True), np.asarray(state.fit.keep))
 
 
 def without(record: Record, each: Sequence[Terms], theta: Sequence[Array]) -> tuple[Array, Array | None]:
