@@ -26,12 +26,12 @@ class Colours:
     along: Colour
 
 
-def colours_of(residual: Residual) -> Colours:
-    """Fit both."""
+def colours_of(residual: Residual, *, stiff: bool = False) -> Colours:
+    """Fit both; `stiff` as in `colour_of`."""
     white = Colour(None, 1.0)
     size = len(residual.noise)
-    across = colour_of(residual.across, size - 3) if residual.across is not None else white
-    along = colour_of(residual.along[:, None]) if residual.along is not None else white
+    across = colour_of(residual.across, size - 3, stiff=stiff) if residual.across is not None else white
+    along = colour_of(residual.along[:, None], stiff=stiff) if residual.along is not None else white
     return Colours(across, along)
 
 
@@ -79,12 +79,11 @@ def assess(residual: Residual, terms: Terms, colours: Colours, given: Terms | No
     blocked = np.arange(together.count) < first
     count = block_count(len(residual.affine))
     null = grams(residual, together, colours.across, colours.along, count)
-    p = family_p(null, together.sensors, own)
     null_gain = held_out_gain(null, residual.freedom, blocked)
     now = colours
     for _ in range(_ROUNDS):
         estimate = estimated(residual, together, now)
-        after = colours_of(taken_off(residual, together, estimate.theta))
+        after = colours_of(taken_off(residual, together, estimate.theta), stiff=True)
         settled = _alike(after, now)
         now = after
         if settled:
@@ -92,6 +91,7 @@ def assess(residual: Residual, terms: Terms, colours: Colours, given: Terms | No
     blocks = grams(residual, together, now.across, now.along, count)
     n, y = normal(blocks.total())
     estimate = solve(n[0], y[0], own_information(blocks))
+    p = family_p(blocks, together.sensors, own)
     return Assessment(estimate, held_out_gain(blocks, residual.freedom, blocked), null_gain, p, now)
 
 

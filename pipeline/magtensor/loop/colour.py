@@ -45,13 +45,15 @@ class Colour:
         return out.reshape(series.shape)
 
 
-def colour_of(series: Array, freedom: float | None = None) -> Colour:
-    """Fit white noise plus relaxation processes to the mean spectrum of the columns of (N, K).
+def colour_of(series: Array, freedom: float | None = None, *, stiff: bool = False) -> Colour:
+    """Fit white noise plus slow processes to the mean spectrum of the columns of (N, K).
 
     Parameters
     ----------
     series: residuals.
     freedom: how many independent values a row holds; K if None.
+    stiff: white, 1/f and 1/f^2 only, so that the lowest frequencies follow from the middle ones. What a regressor
+        took away there, having followed the noise, is then not missed.
     """
     from scipy.fft import dct
     from scipy.optimize import nnls
@@ -71,8 +73,8 @@ def colour_of(series: Array, freedom: float | None = None) -> Colour:
     level = np.array([power[a - 1 : b - 1].mean() for a, b in zip(edges[:-1], edges[1:], strict=True)])
     centre = np.array([frequency[a - 1 : b - 1].mean() for a, b in zip(edges[:-1], edges[1:], strict=True)])
     count = np.diff(edges) * k * share
-    taus = np.geomspace(2.0, 10.0 * n, 3 * max(2, int(np.log10(n))))
-    shapes = np.column_stack([np.ones_like(centre), *[_relaxation(centre, t) for t in taus]])
+    shapes_of = _laws if stiff else _relaxations
+    shapes = shapes_of(centre, n)
     # chi-square weights from the fitted level itself: two rounds settle them
     model = level
     for _ in range(4):
@@ -85,11 +87,23 @@ def colour_of(series: Array, freedom: float | None = None) -> Colour:
     if white <= 0:
         white = float(np.min(model))
     every = np.concatenate([[frequency[0] / 2], frequency])
-    total = white + sum((a * _relaxation(every, t) for a, t in zip(found[1:], taus, strict=True)), np.zeros(n))
+    total = white + shapes_of(every, n)[:, 1:] @ found[1:]
     relative = np.maximum(total / white, 1.0)
     if relative[1] < 1.05:
         return Colour(None, white)
     return Colour(relative, white)
+
+
+def _relaxations(frequency: Array, n: int) -> Array:
+    """White noise and first-order processes of time constants from two samples to ten surveys, (M, 1 + Q)."""
+    taus = np.geomspace(2.0, 10.0 * n, 3 * max(2, int(np.log10(n))))
+    return np.column_stack([np.ones_like(frequency), *[_relaxation(frequency, t) for t in taus]])
+
+
+def _laws(frequency: Array, n: int) -> Array:
+    """White noise, 1/f and 1/f^2, (M, 3), each 1 at the survey's own frequency."""
+    slow = 1.0 / (2.0 * n * frequency)
+    return np.column_stack([np.ones_like(frequency), slow, slow**2])
 
 
 def _relaxation(frequency: Array, tau: float) -> Array:

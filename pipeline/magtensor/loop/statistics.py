@@ -12,7 +12,8 @@ from magtensor.calibration.types import Array
 from magtensor.loop.evidence import Grams, held_out, normal
 
 IDENTIFIABLE = 1e-6  # of a regressor's own information: a direction with less left is not estimated
-BLOCK_COUNTS = (100, 30, 12)  # long blocks protect against correlation longer than a short block
+BLOCK_COUNTS = (120, 30, 12)  # long blocks protect against correlation longer than a short block
+LEAST_BLOCKS = 6
 FOLDS = 10
 LEAST_T = 2.0  # paired t of the held-out gain over folds
 LEAST_SHARE_OF_FOLDS = 0.8  # a strong slow effect gains very unevenly, which keeps t low, but it gains nearly everywhere
@@ -73,72 +74,61 @@ def own_information(g: Grams) -> Array:
     return out
 
 
-def wald_p(g: Grams, subset: Sequence[int] | None = None) -> float:
+def family_p(g: Grams, sensors: Sequence[str], subset: Sequence[int] | None = None) -> float:
     """P value that the subset's coefficients (all if None) are zero, the others being free.
 
-    Delete-one-block jackknife covariance (CR3) of the coefficients, Hotelling's F, for several block lengths, the
-    largest p taken. A family with more identifiable directions than a third of the blocks cannot be tested at that
-    block count; if none is left, p is 1.
+    For several block lengths, the largest p taken: a noise correlated for longer than the short blocks does not fool
+    the long ones. Where a family has more directions than a third of the blocks, it is tested sensor by sensor and the
+    sensors are combined (valid under any dependence). If no block length serves, p is 1.
 
     Parameters
     ----------
     g: the finest blocks.
-    """
-    from scipy.stats import f as f_distribution
-
-    full_n, full_y = normal(g.total())
-    scale = own_information(g)
-    chosen = np.arange(g.count) if subset is None else np.asarray(subset, dtype=int)
-    reduced_n, reduced_y = _without_others(full_n, full_y, chosen, scale)
-    basis, _ = _directions(reduced_n[0], scale[chosen])
-    p = basis.shape[1]
-    if p == 0:
-        return 1.0
-    information = basis.T @ reduced_n[0] @ basis
-    theta = np.linalg.solve(information, basis.T @ reduced_y[0])
-    unit = np.sqrt(np.diag(information))
-    worst = 0.0
-    tried = False
-    finest = len(g.zz)
-    for count in sorted({min(c, finest) for c in BLOCK_COUNTS}, reverse=True):
-        if count < 3 * p or count < 6:
-            continue
-        part = g if count == finest else g.merged(count)
-        n, y = normal(part.without_each())
-        n, y = _without_others(n, y, chosen, scale)
-        small, right = basis.T @ n @ basis, y @ basis
-        if np.linalg.eigvalsh(small / np.outer(unit, unit))[:, 0].min() < LEAST_LEFT:
-            return 1.0  # a single block holds nearly all there is to know: nothing can confirm it
-        try:
-            each = np.linalg.solve(small, right[:, :, None])[:, :, 0]
-        except np.linalg.LinAlgError:
-            return 1.0
-        spread = each - theta
-        covariance = (count - 1) / count * spread.T @ spread
-        try:
-            t2 = float(theta @ np.linalg.solve(covariance, theta))
-        except np.linalg.LinAlgError:
-            return 1.0
-        statistic = (count - p) / (p * (count - 1)) * t2
-        worst = max(worst, float(f_distribution.sf(statistic, p, count - p)))
-        tried = True
-    return worst if tried else 1.0
-
-
-def family_p(g: Grams, sensors: Sequence[str], subset: Sequence[int] | None = None) -> float:
-    """P value of a family of terms: jointly, or sensor by sensor where there are too many for the blocks.
-
-    Parameters
-    ----------
     sensors: (P,) whose each term is.
     """
     chosen = list(range(g.count)) if subset is None else list(subset)
-    if 3 * len(chosen) <= len(g.zz):
-        return wald_p(g, chosen)
     groups = [[i for i in chosen if sensors[i] == name] for name in dict.fromkeys(sensors[i] for i in chosen)]
-    if len(groups) == 1:
-        return wald_p(g, chosen)
-    return cauchy_combination([wald_p(g, group) for group in groups])
+    finest = len(g.zz)
+    found: list[float] = []
+    for count in sorted({min(c, finest) for c in BLOCK_COUNTS}, reverse=True):
+        if count < LEAST_BLOCKS:
+            continue
+        part = g if count == finest else g.merged(count)
+        if 3 * len(chosen) <= count:
+            found.append(wald_p(part, chosen))
+            continue
+        fitting = [wald_p(part, group) for group in groups if 3 * len(group) <= count]
+        if len(fitting) == len(groups) > 1:
+            found.append(cauchy_combination(fitting))
+    return max(found, default=1.0)
+
+
+def wald_p(g: Grams, chosen: Sequence[int]) -> float:
+    """P value that the chosen coefficients are zero, the others free: delete-one-block jackknife (CR3), Hotelling's F."""
+    from scipy.stats import f as f_distribution
+
+    count = len(g.zz)
+    subset = np.asarray(chosen, dtype=int)
+    scale = own_information(g)
+    full_n, full_y = _without_others(*normal(g.total()), subset, scale)
+    basis, _ = _directions(full_n[0], scale[subset])
+    p = basis.shape[1]
+    if p == 0 or p >= count:
+        return 1.0
+    information = basis.T @ full_n[0] @ basis
+    theta = np.linalg.solve(information, basis.T @ full_y[0])
+    unit = np.sqrt(np.diag(information))
+    n, y = _without_others(*normal(g.without_each()), subset, scale)
+    small, right = basis.T @ n @ basis, y @ basis
+    if np.linalg.eigvalsh(small / np.outer(unit, unit))[:, 0].min() < LEAST_LEFT:
+        return 1.0  # a single block holds nearly all there is to know: nothing can confirm it
+    spread = np.linalg.solve(small, right[:, :, None])[:, :, 0] - theta
+    covariance = (count - 1) / count * spread.T @ spread
+    try:
+        t2 = float(theta @ np.linalg.solve(covariance, theta))
+    except np.linalg.LinAlgError:
+        return 1.0
+    return float(f_distribution.sf((count - p) / (p * (count - 1)) * t2, p, count - p))
 
 
 def _without_others(n: Array, y: Array, chosen: NDArray[np.int_], scale: Array) -> tuple[Array, Array]:
