@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -52,6 +52,18 @@ def atomic_set(directory: Path, last: str) -> Iterator[Path]:
             os.replace(partial / name, directory / name)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
+
+
+def refuse_overwriting(outputs: Iterable[Path], inputs: Iterable[Path]) -> None:
+    """See that nothing is written over what it is made from.
+
+    Raises:
+        UsageError: an output is an input.
+    """
+    read = {p.resolve() for p in inputs}
+    for output in outputs:
+        if output.resolve() in read:
+            raise UsageError(f"{output}: the output would replace this input; name another with --output")
 
 
 def require_writable(directory: Path) -> None:

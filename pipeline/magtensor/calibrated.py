@@ -46,11 +46,21 @@ def stored(calibration: ArrayCalibration, sensors: list[str], **facts: Any) -> d
 
 
 def restored(survey: Survey) -> ArrayCalibration:
-    """The calibration that `stored` put into a survey."""
+    """The calibration that `stored` put into a survey.
+
+    Raises:
+        DataError: it is not complete, or its numbers cannot be a calibration.
+    """
     matrix = survey["calibration/matrix"]
+    values, offset = (np.asarray(survey.values(f"calibration/{n}"), dtype=float) for n in ("matrix", "offset"))
+    if not (np.isfinite(values).all() and np.isfinite(offset).all() and (np.linalg.det(values) != 0).all()):
+        raise DataError(
+            "the stored calibration is damaged: its matrices and offsets are not all finite and regular",
+            where=str(survey.attributes.get("source", "")),
+        )
     return ArrayCalibration(
-        np.asarray(matrix.values, dtype=float),
-        np.asarray(survey.values("calibration/offset"), dtype=float),
+        values,
+        offset,
         np.asarray(survey.values("calibration/covariance"), dtype=float),
         str(matrix.attrs["frame"]),
         tuple(json.loads(matrix.attrs["unobservable"])),

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
+
+if TYPE_CHECKING:
+    from magtensor.survey.model import Survey
 
 
 @dataclass(frozen=True)
@@ -28,6 +31,21 @@ class Verdict:
 
 
 STATES = ("pass", "warn", "fail")
+
+
+def told(survey: Survey, most: int = 5) -> tuple[str, ...]:
+    """What the terminal says of the verdicts that a survey holds: those that failed, and how many are worth a look."""
+    if "qc/state" not in survey:
+        return ()
+    states, names, words = (survey.values(f"qc/{k}").tolist() for k in ("state", "metric", "words"))
+    failed = [i for i, state in enumerate(states) if state == "fail"]
+    lines = [f"QC failed: {names[i]}: {words[i]}" for i in failed[:most]]
+    if len(failed) > most:
+        lines.append(f"QC failed: {len(failed) - most} more: {', '.join(names[i] for i in failed[most:])}")
+    warned = [names[i] for i, state in enumerate(states) if state == "warn"]
+    if warned:
+        lines.append(f"QC: worth a look: {', '.join(warned)}")
+    return tuple(lines)
 
 
 def worst(verdicts: list[Verdict]) -> str:

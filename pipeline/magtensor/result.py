@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from magtensor.provenance import Provenance
 
 RESULT, CALIBRATION, VERDICT, REPORT = "result.nc", "calibration.nc", "verdict.json", "report.html"
+FILES = (RESULT, CALIBRATION, VERDICT, REPORT)
 GROUPS = ("calibrated", "calibration", "residual", "qc")
 DETRENDED = ("total_field", "total_field_std", "diurnal")  # of the array's own variables, these are results
 
@@ -114,15 +115,16 @@ def open_result(path: Path) -> Survey:
     import xarray as xr
 
     from magtensor.errors import DataError
+    from magtensor.survey.hdf5 import why_unreadable
 
     try:
         with xr.open_datatree(path, engine="h5netcdf", decode_times=False) as opened:
             tree = opened.load()
     except FileNotFoundError as error:
         raise DataError("no such file", where=str(path)) from error
-    except (OSError, ValueError, KeyError) as error:
+    except (OSError, ValueError, KeyError, RuntimeError, TypeError) as error:
         raise DataError(
-            f"cannot be read: {error}", where=str(path), hint="name a calibration.nc or result.nc"
+            why_unreadable(path, str(error)), where=str(path), hint="name a calibration.nc or result.nc"
         ) from error
     tree.attrs["source"] = str(path)
     return Survey(tree, (), dict(tree.attrs))

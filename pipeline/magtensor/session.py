@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from magtensor import provenance, result
-from magtensor.atomic import require_writable
+from magtensor.atomic import refuse_overwriting, require_writable
 from magtensor.errors import DataError
 from magtensor.provenance import Provenance
+from magtensor.qc import told
 from magtensor.recipe.plan import Plan, plan, read_plan
 from magtensor.recipe.source import Document
 from magtensor.runner import run
@@ -30,7 +31,7 @@ class Finished:
         sentence: the verdict in one sentence.
         made_by: the provenance, content hash included.
         survey: after the last stage.
-        notes: what a re-run has to say about differences.
+        notes: what a re-run has to say about differences, and the QC verdicts that are not passed.
     """
 
     directory: Path
@@ -82,7 +83,7 @@ def run_recipe(
         planned = read_plan(recipe, overrides=overrides, plugin_folders=plugin_folders, survey=survey)
     finished = run_plan(planned, output, verify=verify, progress=progress)
     if before is not None and not overrides and survey is None:
-        return replace(finished, notes=compare(before, finished.made_by))
+        return replace(finished, notes=(*compare(before, finished.made_by), *finished.notes))
     return finished
 
 
@@ -92,13 +93,14 @@ def run_plan(
     """Run a plan and write the files of the contract; as `run_recipe`."""
     require_writable(output)
     source = planned.source()
+    refuse_overwriting([output / name for name in result.FILES], [*source.files(), *([verify] if verify else [])])
     if progress is not None:
         progress("start")
     done = run(planned, empty_survey(planned), progress=progress)
     made_by = provenance.collect(planned, done.records, source.files())
     outcome = verdict(done.survey, verify=verification(done.survey, verify, planned) if verify else None)
     made_by = result.write(output, done.survey, made_by, outcome)
-    return Finished(output, outcome, sentence(outcome), made_by, done.survey)
+    return Finished(output, outcome, sentence(outcome), made_by, done.survey, told(done.survey))
 
 
 def again(
@@ -176,6 +178,11 @@ def apply_to(calibration: Survey, path: Path, planned: Plan, *, tolerant: bool =
     elif refinement is not None:
         measured = five(survey.values("calibrated/tensor"))
         survey = survey.merged(refined(measured, refinement_noise(calibration), refinement))
+    else:
+        raise DataError(
+            "it holds no calibration", where=str(calibration.attributes.get("source", "")),
+            hint="name a calibration.nc or result.nc",
+        )  # fmt: skip
     return survey
 
 
@@ -223,6 +230,7 @@ def apply(calibration: Path, survey: Path, output: Path | None = None) -> Path:
         The file written.
     """
     target = output or survey.with_name(f"{survey.stem}.calibrated.nc")
+    refuse_overwriting([target], [survey, calibration])
     require_writable(target.parent)
     stored = result.open_result(calibration)
     made_by = provenance.read(calibration)

@@ -203,5 +203,5 @@ def test_a_checksummed_chunk_that_is_corrupt_is_named(tmp_path: Path) -> None:
     content = bytearray(path.read_bytes())
     content[place + 100] ^= 0xFF
     path.write_bytes(content)
-    with pytest.raises(DataError, match=r"chunk\.h5: b_raw: the data cannot be read"):
+    with pytest.raises(DataError, match=r"chunk\.h5: b_raw: the values cannot be read"):
         read_canonical(path)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from magtensor.atomic import refuse_overwriting, require_writable
 from magtensor.recipe.plan import override
 from magtensor.recipe.problems import Problems
 from magtensor.recipe.source import load_yaml
@@ -19,12 +20,14 @@ def simulate_file(scenario: Path, output: Path, overrides: Sequence[str] = ()) -
         overrides: `PATH=VALUE` texts, e.g. `seed=7` or `instrument.noise.white_sd_nT=1`.
 
     Raises:
-        UsageError: every mistake in the scenario, with file and line.
+        UsageError: every mistake in the scenario, with file and line; or the output cannot be written.
     """
     from magtensor.simulate.output import write
     from magtensor.simulate.run import simulate
     from magtensor.simulate.scenario import Scenario
 
+    refuse_overwriting([output], [scenario])
+    require_writable(output.parent)
     document = load_yaml(scenario)
     for text in overrides:
         document = override(document, text)

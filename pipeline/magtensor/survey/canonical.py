@@ -61,6 +61,8 @@ def survey_from(tables: Tables) -> Survey:
     """
     notes = list(tables.notes)
     for name in ("time", "b_raw"):
+        if name not in tables.columns and "calibrated/b" in tables.columns:
+            raise DataError("this is a result of magtensor, not a survey: it holds no raw output", where=tables.where)
         if name not in tables.columns:
             raise DataError(
                 f"there is no dataset {name}: this is not a survey in the canonical layout",

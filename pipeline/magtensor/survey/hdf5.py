@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 # What h5py raises when the bytes on disk are not what the file's own description promises.
 _BROKEN = (OSError, RuntimeError, KeyError, ValueError, TypeError, MemoryError, OverflowError)
 _NOT_A_VARIABLE = "This is a netCDF dimension but not a netCDF variable"
+COPY = "copy it again from its source; the recording may have been interrupted"
 _BOOKKEEPING = {
     "DIMENSION_LIST", "REFERENCE_LIST", "CLASS", "NAME", "_Netcdf4Dimid", "_Netcdf4Coordinates", "_NCProperties",
     "_nc3_strict", "units", "_FillValue", "missing_value", "scale_factor", "add_offset", "coordinates",
@@ -44,24 +45,25 @@ def _opened(path: Path) -> Iterator[h5py.File]:
         # A reader needs no lock, and file systems without locks would refuse one.
         file = h5py.File(path, "r", locking="best-effort")
     except OSError as error:
-        raise DataError(_why_not_opened(path, str(error)), where=path.name, hint=_hint(str(error))) from error
+        raise DataError(why_unreadable(path, str(error)), where=path.name, hint=_hint(str(error))) from error
     with file:
         yield file
 
 
-def _why_not_opened(path: Path, message: str) -> str:
+def why_unreadable(path: Path, message: str) -> str:
+    """What the HDF5 library's complaint about a file means, without its words."""
     if "truncated file" in message:
         return "the HDF5 file is truncated: it ends before its own index says it does"
     if "signature not found" in message:
         return f"this is not an HDF5 file (it starts with {path.open('rb').read(8)!r})"
-    if "lock" in message:
+    if "unable to lock" in message:
         return "the HDF5 file is locked by another process that writes it"
-    return f"the HDF5 file cannot be opened: {message}"
+    return "the HDF5 file is damaged, or is not laid out as this file should be"
 
 
 def _hint(message: str) -> str:
     if "truncated file" in message:
-        return "copy it again from its source; the recording may have been interrupted"
+        return COPY
     if "signature not found" in message:
         return "a file of another kind needs a mapping in the recipe; `magtensor inspect` proposes one"
     return ""
@@ -80,7 +82,9 @@ def _read_one(path: Path) -> Tables:
                     columns[column.name] = column
             attributes = plain_attributes(file.attrs)
         except _BROKEN as error:
-            raise DataError(f"the HDF5 file is corrupt: {error}", where=path.name) from error
+            raise DataError(
+                "the HDF5 file is damaged: its list of datasets cannot be read", where=path.name, hint=COPY
+            ) from error
     if not columns:
         raise DataError("the HDF5 file holds no dataset", where=path.name)
     rows = max((c.shape[0] for c in columns.values() if c.shape), default=0)
@@ -88,6 +92,10 @@ def _read_one(path: Path) -> Tables:
 
 
 def _columns_of(path: Path, name: str, item: h5py.Dataset) -> Iterator[Column]:
+    import h5py
+
+    if item.dtype.kind == "O" and h5py.check_string_dtype(item.dtype) is None:
+        return  # references, or rows of unequal length: nothing that a survey could use
     if item.shape is None or _text(item.attrs.get("NAME", b"")).startswith(_NOT_A_VARIABLE):
         return
     attributes = plain_attributes(item.attrs)
@@ -131,9 +139,11 @@ def _loader(path: Path, name: str, part: str | None = None) -> Callable[[], NDAr
                     return np.asarray(item.asstr(errors="replace")[()], dtype=str)
                 values = item[()] if part is None else item[()][part]
                 attributes = plain_attributes(item.attrs)
+            except MemoryError as error:
+                raise DataError("its values do not fit into the memory", where=where) from error
             except _BROKEN as error:
                 raise DataError(
-                    f"the data cannot be read: {error}", where=where, hint="the file is truncated or corrupt here"
+                    "the values cannot be read: the file is truncated or damaged here", where=where, hint=COPY
                 ) from error
         if values.dtype.kind == "S":
             return np.char.decode(values, "utf-8", "replace")
