@@ -44,7 +44,7 @@ class ErrorModels:
     """Marks an option of a stage that names error models; see `ErrorModelsChoice`."""
 
 
-ErrorModelsChoice = Annotated[Any, ErrorModels()]  # names in the recipe, {name: (component, settings given)} in the stage
+ErrorModelsChoice = Annotated[Any, ErrorModels()]  # names in the recipe, {name: (component, settings)} in the stage
 
 
 class PluginError(Exception):

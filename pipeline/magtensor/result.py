@@ -88,7 +88,7 @@ def _only(tree: xr.DataTree, *names: str) -> xr.DataTree:
     import xarray as xr
 
     part = xr.DataTree.from_dict({f"/{n}": tree[n].to_dataset() for n in names if n in tree.children})
-    part.attrs = tree.attrs.copy()
+    part.attrs.update(tree.attrs)
     return part
 
 
@@ -127,7 +127,7 @@ def open_result(path: Path) -> Survey:
             why_unreadable(path, str(error)), where=str(path), hint="name a calibration.nc or result.nc"
         ) from error
     tree.attrs["source"] = str(path)
-    return Survey(tree, (), dict(tree.attrs))
+    return Survey(tree, (), {str(k): v for k, v in tree.attrs.items()})
 
 
 def sensors_of(calibration: Survey) -> list[str]:

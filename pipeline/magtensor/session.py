@@ -15,7 +15,7 @@ from magtensor.qc import told
 from magtensor.recipe.plan import Plan, plan, read_plan
 from magtensor.recipe.source import Document
 from magtensor.runner import run
-from magtensor.survey.model import Survey
+from magtensor.survey.model import Survey, Variable
 from magtensor.verdict import sentence, survey_block, verdict
 
 HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
@@ -147,12 +147,11 @@ def with_declared_alone(calibrated: Survey) -> Survey:
     """The calibration before anything was adopted: its own C and o, no effects."""
     from magtensor.survey.model import without_variables
 
-    variables = {
-        f"calibration/{name}": (calibrated[f"calibration/{name}"].dims, calibrated.values(f"declared/{name}"), {})
-        for name in ("matrix", "offset")
-    }
-    matrix = calibrated["calibration/matrix"]
-    variables["calibration/matrix"] = (matrix.dims, calibrated.values("declared/matrix"), dict(matrix.attrs))
+    variables: dict[str, Variable] = {}
+    for name in ("matrix", "offset"):
+        now = calibrated[f"calibration/{name}"]
+        dims = [str(d) for d in now.dims]
+        variables[f"calibration/{name}"] = (dims, calibrated.values(f"declared/{name}"), dict(now.attrs))
     return without_variables(calibrated, "calibration/effects").merged(variables)
 
 

@@ -61,6 +61,7 @@ def close_loop(
     first, last = found.first, found.last
     require_determined(record, last, how)
     raw, field = without(record, [a.terms(last.excitation) for a in last.adopted], last.theta)
+    assert field is not None and record.total_field is not None  # the stage needs a total field
     calibration = calibrated(last.fit, field, raw, reference_noise_nT)
     outcome = {
         "declared": ["linear", *(a.name for a in begin)],

@@ -15,7 +15,7 @@ import numpy as np
 
 from magtensor.errors import NotEnoughData
 
-from .types import Array
+from .types import Array, Mask
 
 LEAST_SAMPLES_PER_AXIS = 20  # below this the noise is taken as equal on all axes of the array
 LEAST_SHARE = 0.05  # of the array's mean noise variance: a smaller estimate is a Heywood case, not a quiet axis
@@ -52,7 +52,7 @@ class CommonField:
         return out
 
 
-def common_field(raw: Array, noise: Array | None = None, keep: Array | None = None) -> CommonField:
+def common_field(raw: Array, noise: Array | None = None, keep: Mask | None = None) -> CommonField:
     """Find the plane, and the noise of each output unless it is given.
 
     Parameters
@@ -68,7 +68,9 @@ def common_field(raw: Array, noise: Array | None = None, keep: Array | None = No
     used = raw if keep is None else raw[keep]
     count, size = len(used), 3 * raw.shape[1]
     if count < 5:
-        raise NotEnoughData(f"{count} samples cannot tell the field from the sensors", hint="five attitudes are the least")
+        raise NotEnoughData(
+            f"{count} samples cannot tell the field from the sensors", hint="five attitudes are the least"
+        )
     mean, moments = _moments(used)
     if noise is not None:
         sd = np.asarray(noise, dtype=float).ravel()

@@ -13,7 +13,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from magtensor.errors import DataError, NotEnoughData
 
@@ -24,7 +23,7 @@ from .coverage import WORST_ERROR, coverage, require_coverage
 from .maximum_likelihood import ScalarFit, fit_scalar
 from .noise import noise_std, shares_of_two
 from .scalar import checked_samples
-from .types import Array, ArrayCalibration
+from .types import Array, ArrayCalibration, Mask
 
 FALSE_REJECTION = 0.01  # probability that one clean sample of the whole survey is rejected
 LEAST_FOR_REJECTION = 50  # with fewer samples the fit bends to an outlier, and no residual can tell which it was
@@ -46,7 +45,7 @@ class JointFit:
     offset: Array
     plane: CommonField
     scalar: ScalarFit
-    keep: Array
+    keep: Mask
 
 
 def fit_joint(
@@ -57,7 +56,7 @@ def fit_joint(
     reference_noise: float = 0.0,
     robust: bool = True,
     worst_error: float = WORST_ERROR,
-    keep: NDArray[np.bool_] | None = None,
+    keep: Mask | None = None,
     complete: bool = True,
 ) -> JointFit:
     """Fit C and o of all sensors to their outputs and the total field.
@@ -99,7 +98,7 @@ def fit_joint(
             plane = common_field(raw, given, keep)
             y = plane.coordinates(raw)
             scalar = fit_scalar(y[keep], total_field[keep], reference_noise)
-        if two and round_ < _TOLD_APART:
+        if two and given is not None and round_ < _TOLD_APART:
             given = _told_apart(given, _unfold(plane, scalar, sensors), raw, total_field)
             continue
         if not judge:
@@ -138,7 +137,7 @@ def _told_apart(noise: Array, found: tuple[Array, Array], raw: Array, total_fiel
 def _refuse_sensors(forward: Array, offset: Array, raw: Array, total_field: Array) -> None:
     """Mirrored sensors, and those that have nothing in common with the others, whose C is next to singular."""
     some = slice(None, None, max(1, len(raw) // 20_000))
-    correction = np.linalg.pinv(forward, rcond=1e-9)
+    correction = np.asarray(np.linalg.pinv(forward, rcond=1e-9), dtype=np.float64)
     require_agreement(np.einsum("sij,nsj->nsi", correction, raw[some] - offset), total_field[some])
     words = mirrored_words(correction)
     if words:
@@ -156,8 +155,8 @@ def _unfold(plane: CommonField, scalar: ScalarFit, sensors: int) -> tuple[Array,
 
 
 def _believable(
-    plane: CommonField, scalar: ScalarFit, raw: Array, total_field: Array, reference_noise: float, keep: Array
-) -> Array:
+    plane: CommonField, scalar: ScalarFit, raw: Array, total_field: Array, reference_noise: float, keep: Mask
+) -> Mask:
     """(N,) samples whose squared whitened residual noise explains, at `FALSE_REJECTION` for the whole survey.
 
     Scaled by the median, so that outliers cannot hide each other.
@@ -204,7 +203,7 @@ def calibrated(fit: JointFit, total_field: Array, raw: Array, reference_noise: f
     q = nearest_frame(fit.forward)
     forward = fit.forward @ q
     covariance = _forward_covariance(fit, q, raw, total_field, reference_noise)
-    matrix = np.linalg.inv(forward)
+    matrix = np.asarray(np.linalg.inv(forward), dtype=np.float64)
     size = 12 * len(forward)
     to_matrix = np.zeros((size, size))
     for s, m in enumerate(matrix):

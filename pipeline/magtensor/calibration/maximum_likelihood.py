@@ -30,13 +30,11 @@ class ScalarFit:
     Attributes:
         matrix: (3, 3) nT per unit of y; offset: (3,) in units of y.
         chi2: mean square of the whitened residual per degree of freedom.
-        iterations: Gauss-Newton steps taken.
     """
 
     matrix: Array
     offset: Array
     chi2: float
-    iterations: int
 
 
 def whitened_residual(
@@ -82,7 +80,7 @@ def fit_scalar(y: Array, total_field: Array, reference_noise: float = 0.0, most_
     p = np.concatenate([upper(found.shape)[_UPPER[:, 0], _UPPER[:, 1]], found.offset])
     cost = _cost(p, y, total_field, reference_noise)
     damping = 0.0
-    for iteration in range(1, most_iterations + 1):
+    for _ in range(most_iterations):
         normal, gradient = _normal(p, y, total_field, reference_noise)
         scale = np.sqrt(np.diag(normal))
         if not (np.isfinite(scale).all() and (scale > 0).all()):
@@ -106,7 +104,7 @@ def fit_scalar(y: Array, total_field: Array, reference_noise: float = 0.0, most_
         raise NotEnoughData("the scalar fit does not converge", hint="look for disturbed samples, or add attitudes")
     matrix = np.zeros((3, 3))
     matrix[_UPPER[:, 0], _UPPER[:, 1]] = p[:6]
-    return ScalarFit(matrix, p[6:], cost / max(len(y) - 9, 1), iteration)
+    return ScalarFit(matrix, p[6:], cost / max(len(y) - 9, 1))
 
 
 def _unpack(p: Array) -> tuple[Array, Array]:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 PARAMETERS_PER_SENSOR = 12  # nine of the matrix, row by row, then three of the offset
 

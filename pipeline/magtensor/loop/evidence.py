@@ -7,6 +7,7 @@ serves every output. Along the field the regressors are products with the gain, 
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -88,7 +89,7 @@ def grams(residual: Residual, terms: Terms, across: Colour, along: Colour, block
     """
     n, size = len(residual.affine), len(residual.noise)
     edges = np.linspace(0, n, blocks + 1).round().astype(int)
-    pieces = list(zip(edges[:-1], edges[1:], strict=True))
+    pieces = list(itertools.pairwise(edges))
     k, p = terms.series.shape[1], terms.count
     raw = terms.part_output != REFERENCE
     zz, zd, dd = np.zeros((blocks, 4, 4)), np.zeros((blocks, 4, k)), np.zeros((blocks, k, k))
@@ -166,7 +167,7 @@ def _incidence(g: Grams) -> Array:
     return into
 
 
-def held_out(train: Grams, test: Grams, theta: Array, blocked: Array | None = None) -> tuple[Array, Array]:
+def held_out(train: Grams, test: Grams, theta: Array, blocked: NDArray[np.bool_] | None = None) -> tuple[Array, Array]:
     """Sum of squared residuals of each test set, without and with the terms.
 
     The fit's own freedom is fitted anew on each training set, with the terms held at theta (their residual is what

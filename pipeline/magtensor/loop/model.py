@@ -71,8 +71,8 @@ class Record:
     def excitation(self, output: Array, field_: Array, lines: Sequence[float] = ()) -> Excitation:
         """What error models see, given the modelled outputs and fields (N, S, 3)."""
         return Excitation(
-            self.time, self.start, self.sensors, output, field_, self.quiet_field, self.logged, self.units, self.run, self.segment,
-            self.position, self.attitude, tuple(lines),
+            self.time, self.start, self.sensors, output, field_, self.quiet_field, self.logged, self.units, self.run,
+            self.segment, self.position, self.attitude, tuple(lines),
         )  # fmt: skip
 
 

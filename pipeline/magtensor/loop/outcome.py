@@ -10,7 +10,8 @@ from magtensor.loop.assessment import Colours, block_count
 from magtensor.loop.colour import Colour
 from magtensor.loop.evidence import grams
 from magtensor.loop.model import Adopted, Record, State
-from magtensor.loop.search import Candidate, Search, Step, profiled, put_back
+from magtensor.loop.screening import Candidate, profiled
+from magtensor.loop.search import Search, Step, put_back
 from magtensor.loop.settings import Range
 from magtensor.loop.statistics import held_out_gain
 from magtensor.loop.terms import joined
@@ -126,4 +127,3 @@ def why(candidate: Candidate, winner: Candidate | None) -> str:
         ahead = winner.assessment.gain.total
         return f"{winner.model.name} explained more (held-out gain {ahead:.4g}): {figures}"
     return figures
-

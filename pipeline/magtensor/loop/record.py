@@ -36,7 +36,7 @@ def record_of(survey: Survey, means: Mapping[str, Array] | None = None, *, every
             use &= np.isfinite(total_field)
     logged, units = channels_of(survey)
     for name, values in list(logged.items()):
-        finite = np.isfinite(values.reshape(len(values), -1)).all(axis=1)
+        finite = np.asarray(np.isfinite(values.reshape(len(values), -1)).all(axis=1))
         if (finite[use].mean() if use.any() else 0.0) < 0.5:
             del logged[name]  # hardly ever there
         elif not finite.all():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -16,7 +17,7 @@ BLOCK_COUNTS = (120, 30, 12)  # long blocks protect against correlation longer t
 LEAST_BLOCKS = 6
 FOLDS = 10
 LEAST_T = 2.0  # paired t of the held-out gain over folds
-LEAST_SHARE_OF_FOLDS = 0.8  # a strong slow effect gains very unevenly, which keeps t low, but it gains nearly everywhere
+LEAST_SHARE_OF_FOLDS = 0.8  # a strong slow effect gains unevenly, which keeps t low, but nearly everywhere
 LEAST_LEFT = 1e-3  # of the information in a direction, without any one block
 
 
@@ -104,7 +105,7 @@ def family_p(g: Grams, sensors: Sequence[str], subset: Sequence[int] | None = No
 
 
 def wald_p(g: Grams, chosen: Sequence[int]) -> float:
-    """P value that the chosen coefficients are zero, the others free: delete-one-block jackknife (CR3), Hotelling's F."""
+    """P value that the chosen coefficients are zero, the others free: delete-block jackknife (CR3), Hotelling's F."""
     from scipy.stats import f as f_distribution
 
     count = len(g.zz)
@@ -193,7 +194,7 @@ class Gain:
         return float(np.sqrt(self.before.sum() / count)), float(np.sqrt(max(self.after.sum(), 0.0) / count))
 
 
-def held_out_gain(g: Grams, freedom: int, blocked: Array | None = None) -> Gain:
+def held_out_gain(g: Grams, freedom: int, blocked: NDArray[np.bool_] | None = None) -> Gain:
     """Gain over contiguous folds, a block's gap between training and test.
 
     Parameters
@@ -207,7 +208,7 @@ def held_out_gain(g: Grams, freedom: int, blocked: Array | None = None) -> Gain:
     edges = np.linspace(0, count, folds + 1).round().astype(int)
     test_masks, train_masks = np.zeros((folds, count), dtype=bool), np.ones((folds, count), dtype=bool)
     gap = 1 if count >= 4 * folds else 0
-    for k, (a, b) in enumerate(zip(edges[:-1], edges[1:], strict=True)):
+    for k, (a, b) in enumerate(itertools.pairwise(edges)):
         test_masks[k, a:b] = True
         train_masks[k, max(a - gap, 0) : b + gap] = False
     train, test = g.chosen(train_masks), g.chosen(test_masks)
@@ -220,8 +221,6 @@ def held_out_gain(g: Grams, freedom: int, blocked: Array | None = None) -> Gain:
         without = np.zeros_like(theta)
         keep = np.flatnonzero(blocked)
         if len(keep):
-            without[:, keep] = [
-                solve(n[k][np.ix_(keep, keep)], y[k][keep], scale[keep]).theta for k in range(folds)
-            ]
+            without[:, keep] = [solve(n[k][np.ix_(keep, keep)], y[k][keep], scale[keep]).theta for k in range(folds)]
         before, after = held_out(train, test, without)[1], held_out(train, test, theta)[1]
     return Gain(before, after, test.samples * freedom)

@@ -40,9 +40,7 @@ def effect_variables(
     return {"calibration/effects": (("effect",), np.array(texts, dtype=np.str_), attributes)}
 
 
-def stored_effects(
-    calibration: Survey, registry: Registry
-) -> tuple[list[Adopted], list[Array], dict[str, Array]]:
+def stored_effects(calibration: Survey, registry: Registry) -> tuple[list[Adopted], list[Array], dict[str, Array]]:
     """Effects, coefficients and channel means of a calibration.
 
     Raises:

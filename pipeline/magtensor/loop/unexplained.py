@@ -15,12 +15,14 @@ import numpy as np
 
 from magtensor.calibration.types import Array
 from magtensor.loop.model import Record, State
-from magtensor.loop.search import Candidate, Search
+from magtensor.loop.screening import Candidate
+from magtensor.loop.search import Search
 from magtensor.loop.spectrum import spectral_lines
 
 ALPHA = 0.005  # of each of the tests
 SURROGATES = 199
 BINS = 120  # the common waveform is looked for in means of so many stretches
+NOISE = "what is left is noise: white, and slow noise of each sensor alone"
 MOST_LAG = 0.1  # of the survey, in which a channel is compared with the waveform
 
 
@@ -63,7 +65,7 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
     return {
         "present": present,
         "excess_rms_nT": excess,
-        "description": "; ".join(words) if present else "what is left is noise: white, and slow noise of each sensor alone",
+        "description": "; ".join(words) if present else NOISE,
         "looks_like": _looks_like(last) if present else [],
     }
 
@@ -160,4 +162,3 @@ def _looks_like(candidates: Sequence[Candidate]) -> list[str]:
     """The models that come nearest to explaining it, most significant first."""
     near = sorted((c for c in candidates if c.adjusted_p < 0.05), key=lambda c: c.adjusted_p)
     return [c.model.name for c in near[:5]]
-
