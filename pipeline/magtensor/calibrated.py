@@ -45,6 +45,13 @@ def stored(calibration: ArrayCalibration, sensors: list[str], **facts: Any) -> d
     }  # fmt: skip
 
 
+def left_open(survey: Survey) -> tuple[str, ...]:
+    """What the calibration of a survey could not determine, in words."""
+    if "calibration/matrix" not in survey:
+        return ()
+    return tuple(json.loads(str(survey["calibration/matrix"].attrs.get("unobservable", "[]"))))
+
+
 def restored(survey: Survey) -> ArrayCalibration:
     """The calibration that `stored` put into a survey.
 
@@ -63,7 +70,7 @@ def restored(survey: Survey) -> ArrayCalibration:
         offset,
         np.asarray(survey.values("calibration/covariance"), dtype=float),
         str(matrix.attrs["frame"]),
-        tuple(json.loads(matrix.attrs["unobservable"])),
+        left_open(survey),
         json.loads(matrix.attrs["diagnostics"]),
     )
 

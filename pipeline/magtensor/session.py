@@ -9,6 +9,7 @@ from typing import Any
 
 from magtensor import provenance, result
 from magtensor.atomic import refuse_overwriting, require_writable
+from magtensor.calibrated import left_open
 from magtensor.errors import DataError
 from magtensor.provenance import Provenance
 from magtensor.qc import told
@@ -100,7 +101,8 @@ def run_plan(
     made_by = provenance.collect(planned, done.records, source.files())
     outcome = verdict(done.survey, verify=verification(done.survey, verify, planned) if verify else None)
     made_by = result.write(output, done.survey, made_by, outcome)
-    return Finished(output, outcome, sentence(outcome), made_by, done.survey, told(done.survey))
+    notes = (*(f"not determined: {words}" for words in left_open(done.survey)), *told(done.survey))
+    return Finished(output, outcome, sentence(outcome), made_by, done.survey, notes)
 
 
 def again(

@@ -70,12 +70,13 @@ def side_by_side(calibrations: list[SensorCalibration]) -> ArrayCalibration:
     """Sensors calibrated each alone, each still in a frame of its own."""
     from scipy.linalg import block_diag
 
+    own = (f"sensor {i}: {words}" for i, c in enumerate(calibrations, 1) for words in c.unobservable)
     return ArrayCalibration(
         np.stack([c.matrix for c in calibrations]),
         np.stack([c.offset for c in calibrations]),
         block_diag(*[c.covariance for c in calibrations]),
         f"each sensor's own ({calibrations[0].frame})",
-        ("a rotation of each sensor",),
+        ("a rotation of each sensor", *own),
     )
 
 
@@ -104,6 +105,7 @@ def calibrate_scalar(survey: Survey, *, method: MethodChoice = "chi2017") -> dic
     raw, total_field = survey.values("b_raw"), survey.values("total_field")
     fits = each_sensor(survey, lambda i, good: method(raw[good, i], total_field[good]))
     together = side_by_side(fits)
+    together = replace(together, unobservable=tuple(by_name(w, survey.sensors) for w in together.unobservable))
     return stored(together, survey.sensors, method=method.__name__) | per_sensor(fits) | corrected(together, survey)
 
 
@@ -136,8 +138,8 @@ def calibrate_array(survey: Survey, *, method: MethodChoice = "joint") -> dict[s
 
 
 @stage(
-    needs=("b_raw", "attitude", "reference/world_field"),
-    uses=("total_field",),
+    needs=("b_raw", "attitude"),
+    uses=("total_field", "reference/world_field"),
     gives=("calibration/*", "calibration/rotation", "calibrated/b", "residual/vector"),
     may_give=("residual/contrast", "residual/total_field", "residual/total_field_before"),
 )
@@ -145,20 +147,53 @@ def calibrate_vector(survey: Survey, *, method: MethodChoice = "linear_regressio
     """Calibrate each sensor against a known vector: the world field turned into the platform by the attitude.
 
     A method is ``f(raw (N, 3) nT, field (N, 3) nT in the platform frame, *, options) -> SensorCalibration``. All
-    twelve parameters are determined, the rotation too.
+    twelve parameters are determined, the rotation too. Where the reference names no `world_field`, its magnitude is
+    the total field and its direction is estimated along with the parameters; a wrong total field is then a scale
+    error that all sensors share.
     """
     from magtensor.attitude import into_platform
 
-    field = into_platform(survey.values("attitude"), survey.values("reference/world_field"))
+    given: dict[str, Any] = {}
+    if "reference/world_field" in survey:
+        free: tuple[str, ...] = ()
+        field = into_platform(survey.values("attitude"), survey.values("reference/world_field"))
+    else:
+        free = ("a scale that all sensors share: the size of the world field is that of the total field",)
+        field, given = estimated_field(survey)
     known = np.isfinite(field).all(axis=1)
     raw = survey.values("b_raw")
     fits = each_sensor(survey, lambda i, good: method(raw[good & known, i], field[good & known]))
-    together = replace(side_by_side(fits), frame="platform", unobservable=())
-    given = common_frame(survey, together, method.__name__) | per_sensor(fits)
+    together = replace(side_by_side(fits), frame="platform", unobservable=free)
+    given |= common_frame(survey, together, method.__name__) | per_sensor(fits)
     residual = together.apply(np.asarray(raw, dtype=float)) - field[:, None]
     attributes = {"units": "nT", "long_name": "b - known field"}
     given["residual/vector"] = (("time", "sensor", "axis"), residual, attributes)
     return given
+
+
+def estimated_field(survey: Survey) -> tuple[np.ndarray, dict[str, Any]]:
+    """(N, 3) nT, the field in the platform frame with the world direction that the sensors tell; and that direction."""
+    from magtensor.attitude import into_platform
+    from magtensor.calibration.world_field import world_direction
+
+    if "total_field" not in survey:
+        raise DataError(
+            "neither the world field nor its size is known",
+            where=str(survey.attributes.get("source", "")),
+            hint="give `world_field` in the recipe's reference, or a total field and the stage detrend_diurnal",
+        )
+    attitude, total_field = survey.values("attitude"), np.asarray(survey.values("total_field"), dtype=float)
+    raw = np.asarray(survey.values("b_raw"), dtype=float)
+    turn = np.stack([into_platform(attitude, axis) for axis in np.eye(3)], axis=2)
+    use = survey.good & np.isfinite(total_field)
+    use &= np.isfinite(turn).all(axis=(1, 2)) & np.isfinite(raw).all(axis=(1, 2))
+    if not use.any():
+        raise NotEnoughData("no sample has all sensors in use, an attitude and a total field")
+    found = world_direction(raw[use], turn[use], total_field[use])
+    attributes = {"units": "nT", "direction_std_deg": float(np.degrees(found.std)), "long_name": "field in the world"}
+    vector = found.direction * float(np.mean(total_field[use]))
+    field: np.ndarray = (turn @ found.direction) * total_field[:, None]
+    return field, {"calibration/world_field": (("axis",), vector, attributes)}
 
 
 def common_frame(survey: Survey, calibration: ArrayCalibration, method: str) -> dict[str, Any]:

@@ -26,6 +26,7 @@ class SensorCalibration:
             raw axes, Yin), "platform" (tied to something outside the sensor).
         residual_rms: nT, of |b| - F over the samples used.
         diagnostics: further figures a method wants to report (condition number, iterations, ...).
+        unobservable: words for what the data leave free, beyond the rotation that no scalar data determine.
     """
 
     matrix: Array
@@ -34,6 +35,7 @@ class SensorCalibration:
     frame: str
     residual_rms: float
     diagnostics: dict[str, float | str] = field(default_factory=dict)
+    unobservable: tuple[str, ...] = ()
 
     def apply(self, m: Array) -> Array:
         """Raw output (..., 3) nT to calibrated field (..., 3) nT in `frame`."""
@@ -51,6 +53,7 @@ class SensorCalibration:
             frame,
             self.residual_rms,
             self.diagnostics,
+            self.unobservable,
         )
 
 
