@@ -87,13 +87,25 @@ def common_field(raw: Array, noise: Array | None = None, keep: Mask | None = Non
     return CommonField(sd, _handed(basis), mean / sd, count, chi2)
 
 
-def output_noise(raw: Array) -> Array:
+def output_noise(raw: Array, keep: Mask | None = None) -> Array:
     """White noise (S, 3) nT of every output, from what second differences in time have in common and have not.
 
     Second differences (over sqrt 6) of the outputs share a plane as the outputs do, and hold nothing slower than a
     few samples: slow effects that no model knows yet cannot pass for noise. Needs at least two sensors.
+
+    Parameters
+    ----------
+    raw: (N, S, 3) nT, finite.
+    keep: (N,) samples to use; a difference that touches another one is left out where enough of them remain.
+
+    Raises
+    ------
+    NotEnoughData: as in `common_field`.
     """
-    return common_field(np.diff(raw, n=2, axis=0) / np.sqrt(6.0)).noise.reshape(raw.shape[1], 3)
+    among = None if keep is None else keep[:-2] & keep[1:-1] & keep[2:]
+    if among is not None and among.sum() < LEAST_SAMPLES_PER_AXIS:
+        among = None
+    return common_field(np.diff(raw, n=2, axis=0) / np.sqrt(6.0), keep=among).noise.reshape(raw.shape[1], 3)
 
 
 def _handed(basis: Array) -> Array:

@@ -82,7 +82,8 @@ def fit_joint(
     judge = keep is None and robust and len(raw) >= LEAST_FOR_REJECTION
     keep = np.ones(len(raw), dtype=bool) if keep is None else keep
     sensors = raw.shape[1]
-    given = output_noise(raw) if noise is None and sensors > 1 and len(raw) >= LEAST_FOR_REJECTION else noise
+    own_noise = noise is None and sensors > 1 and len(raw) >= LEAST_FOR_REJECTION
+    given = output_noise(raw, keep) if own_noise else noise
     two = sensors == 2 and noise is None and given is not None
     for round_ in range(20):
         plane = common_field(raw, given, keep)
@@ -112,7 +113,11 @@ def fit_joint(
                 hint="look for a moving magnetic object, a dead axis or wrong units",
             )
         keep = again
-        if sensors == 1 and noise is None:
+        if own_noise:
+            given = output_noise(raw, keep)  # a spike passes for noise until it is left out
+            if two:
+                given = _told_apart(given, _unfold(plane, scalar, sensors), raw, total_field)
+        elif sensors == 1 and noise is None:
             given = None
     forward, offset = _unfold(plane, scalar, sensors)
     # judged on the calibrated field, whose axes are nearest to those of the sensors
