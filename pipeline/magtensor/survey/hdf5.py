@@ -91,9 +91,10 @@ def _read_one(path: Path) -> Tables:
     return Tables(columns, (path,), attributes, (), (rows,))
 
 
-def _columns_of(path: Path, name: str, item: h5py.Dataset) -> Iterator[Column]:
+def _columns_of(path: Path, key: str | bytes, item: h5py.Dataset) -> Iterator[Column]:
     import h5py
 
+    name = _text(key)  # a name that is no UTF-8 comes as bytes
     if item.dtype.kind == "O" and h5py.check_string_dtype(item.dtype) is None:
         return  # references, or rows of unequal length: nothing that a survey could use
     if item.shape is None or _text(item.attrs.get("NAME", b"")).startswith(_NOT_A_VARIABLE):
@@ -106,12 +107,12 @@ def _columns_of(path: Path, name: str, item: h5py.Dataset) -> Iterator[Column]:
         for part in item.dtype.names:
             kind = item.dtype[part]
             yield Column(
-                f"{name}/{part}", f"{origin}/{part}", (*item.shape, *kind.shape), _loader(path, name, part),
+                f"{name}/{part}", f"{origin}/{part}", (*item.shape, *kind.shape), _loader(path, key, part),
                 text=kind.base.kind in "OSU",
             )  # fmt: skip
         return
     yield Column(
-        name, origin, item.shape, _loader(path, name), None if units is None else str(units), _dims(item), kept,
+        name, origin, item.shape, _loader(path, key), None if units is None else str(units), _dims(item), kept,
         item.dtype.kind in "OSU",
     )  # fmt: skip
 
@@ -129,12 +130,12 @@ def _dims(item: h5py.Dataset) -> tuple[str, ...] | None:
     return tuple(names)
 
 
-def _loader(path: Path, name: str, part: str | None = None) -> Callable[[], NDArray[Any]]:
+def _loader(path: Path, key: str | bytes, part: str | None = None) -> Callable[[], NDArray[Any]]:
     def load() -> NDArray[Any]:
-        where = f"{path.name}: {name}"
+        where = f"{path.name}: {_text(key)}"
         with _opened(path) as file:
             try:
-                item = file[name]
+                item = file[key]
                 if item.dtype.kind == "O" and part is None:
                     return np.asarray(item.asstr(errors="replace")[()], dtype=str)
                 values = item[()] if part is None else item[()][part]
