@@ -97,12 +97,13 @@ def _columns_of(path: Path, key: str | bytes, item: h5py.Dataset) -> Iterator[Co
     name = _text(key)  # a name that is no UTF-8 comes as bytes
     if item.dtype.kind == "O" and h5py.check_string_dtype(item.dtype) is None:
         return  # references, or rows of unequal length: nothing that a survey could use
-    if item.shape is None or _text(item.attrs.get("NAME", b"")).startswith(_NOT_A_VARIABLE):
-        return
     attributes = plain_attributes(item.attrs)
+    if item.shape is None or str(attributes.get("NAME", "")).startswith(_NOT_A_VARIABLE):
+        return
     units = attributes.get("units")
     kept = {k: v for k, v in attributes.items() if k not in _BOOKKEEPING}
     origin = f"{path.name}: {name}"
+    scale = attributes.get("CLASS") == "DIMENSION_SCALE"
     if item.dtype.names:
         for part in item.dtype.names:
             kind = item.dtype[part]
@@ -112,14 +113,14 @@ def _columns_of(path: Path, key: str | bytes, item: h5py.Dataset) -> Iterator[Co
             )  # fmt: skip
         return
     yield Column(
-        name, origin, item.shape, _loader(path, key), None if units is None else str(units), _dims(item), kept,
+        name, origin, item.shape, _loader(path, key), None if units is None else str(units), _dims(item, scale), kept,
         item.dtype.kind in "OSU",
     )  # fmt: skip
 
 
-def _dims(item: h5py.Dataset) -> tuple[str, ...] | None:
+def _dims(item: h5py.Dataset, is_scale: bool) -> tuple[str, ...] | None:
     """The dimensions' names from the attached scales; a one-dimensional scale is its own dimension."""
-    if item.attrs.get("CLASS", b"") == b"DIMENSION_SCALE" and item.ndim == 1:
+    if is_scale and item.ndim == 1:
         return (str(item.name).rsplit("/", 1)[-1],)
     names = []
     for number, dim in enumerate(item.dims):
@@ -180,6 +181,8 @@ def plain_attributes(attributes: Any) -> dict[str, Any]:
         if key in _BOOKKEEPING and key in {"DIMENSION_LIST", "REFERENCE_LIST", "_NCProperties"}:
             continue
         try:
+            if not _readable(attributes, key):
+                continue
             value = attributes[key]
         except _BROKEN:
             continue  # an attribute of a type nobody here can read says nothing; the data may still be whole
@@ -195,6 +198,18 @@ def plain_attributes(attributes: Any) -> dict[str, Any]:
             value = [_text(v) if isinstance(v, bytes) else v for v in value.tolist()]
         plain[key] = value
     return plain
+
+
+def _readable(attributes: Any, key: str) -> bool:
+    """Whether an attribute is of a plain type.
+
+    Nothing of a survey is stored as a sequence of variable length, and a damaged byte that turns a text into one
+    makes the HDF5 library read beyond its memory.
+    """
+    import h5py
+
+    kind = attributes.get_id(key).dtype
+    return not kind.hasobject or h5py.check_string_dtype(kind) is not None
 
 
 def _text(value: Any) -> str:
