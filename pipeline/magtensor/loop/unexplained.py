@@ -14,15 +14,19 @@ from typing import Any
 import numpy as np
 
 from magtensor.calibration.types import Array
+from magtensor.loop.excitation import Excitation
 from magtensor.loop.model import Record, State
-from magtensor.loop.screening import Candidate
+from magtensor.loop.screening import WHITE, Candidate
 from magtensor.loop.search import Search
 from magtensor.loop.spectrum import spectral_lines
+from magtensor.loop.terms import Terms
 
 ALPHA = 0.005  # of each of the tests
 SURROGATES = 199
 BINS = 120  # the common waveform is looked for in means of so many stretches
 NOISE = "what is left is noise: white, and slow noise of each sensor alone"
+LEAST_T = 3.0  # paired t over folds of what the direction predicts
+LEAST_FOR_DIRECTION = 60  # samples for each output, at least, before its own polynomial can be asked for
 MOST_LAG = 0.1  # of the survey, in which a channel is compared with the waveform
 
 
@@ -49,6 +53,7 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
     excess = float(np.sqrt(max(residual.square() - 1.0, 0.0)) * residual.scale)
     waveform = common_waveform(state, record)
     line = strongest_line(state, record)
+    turning = predictable_from_direction(state)
     last = found.steps[-1].candidates if found.steps else ()
     suspects = [c for c in last if c.adjusted_p < c.alpha]
     words: list[str] = []
@@ -56,6 +61,8 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
         words.append(_waveform_words(waveform, record))
     if line is not None:
         words.append(f"a line at {line[0]:.4g} Hz (period {1 / line[0]:.4g} s), {line[1]:.3g} nT rms")
+    if turning > 0:
+        words.append(f"{turning:.3g} nT rms of it can be predicted from the direction of the field and how it turns")
     if suspects:
         names = ", ".join(c.model.name for c in suspects)
         words.append(f"significant but of no use on held-out blocks: {names}")
@@ -68,6 +75,64 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
         "description": "; ".join(words) if present else NOISE,
         "looks_like": _looks_like(last) if present else [],
     }
+
+
+def predictable_from_direction(state: State) -> float:
+    """nT rms of the residual that follows the field's direction and its rate of change, whatever the law; 0 if none.
+
+    Any smooth effect of attitude, named or not, is a polynomial of the direction to first order: second and third
+    degree and the rate of change, with coefficients of every output's own, are fitted on some blocks and judged on
+    others. Noise makes such a model worse than none.
+    """
+    from magtensor.loop.assessment import Colours, block_count
+    from magtensor.loop.evidence import grams
+    from magtensor.loop.statistics import Gain, held_out_gain
+    from magtensor.loop.terms import joined
+
+    residual, x = state.residual, state.excitation
+    if len(residual.affine) < LEAST_FOR_DIRECTION * 3 * len(x.sensors):
+        return 0.0
+    terms = _direction_terms(x).at(residual.samples)
+    given = 0
+    if state.terms is not None:
+        given = state.terms.count
+        terms = joined([state.terms, terms])
+    blocked = np.arange(terms.count) < given
+
+    def gain_in(colours: Colours) -> Gain:
+        blocks = grams(residual, terms, colours.across, colours.along, block_count(len(residual.affine)))
+        return held_out_gain(blocks, residual.freedom, blocked)
+
+    gain = gain_in(state.colours)
+    if gain.total <= 0 or gain.t < LEAST_T:
+        return 0.0
+    before, after = gain_in(WHITE).rms  # seen through the filter the amount would be too small
+    return float(np.sqrt(max(before**2 - after**2, 0.0)) * residual.scale)
+
+
+def _direction_terms(x: Excitation) -> Terms:
+    """Every output's own coefficients of monomials of the field's direction and of its rate of change."""
+    b = x.field[:, 0]
+    u = b / np.linalg.norm(b, axis=1, keepdims=True)
+    rate = x.derivative(u)
+    spread = rate.std()
+    columns = [u[:, i] * u[:, j] for i in range(3) for j in range(i, 3) if (i, j) != (2, 2)]
+    thirds = [(i, j, k) for i in range(3) for j in range(i, 3) for k in range(j, 3) if (i, j, k) != (2, 2, 2)]
+    columns += [u[:, i] * u[:, j] * u[:, k] for i, j, k in thirds]
+    if spread > 0:
+        columns += [rate[:, i] / spread for i in range(3)]
+    series = np.column_stack(columns)
+    outputs, k = 3 * len(x.sensors), series.shape[1]
+    part_output, part_series = np.repeat(np.arange(outputs), k), np.tile(np.arange(k), outputs)
+    return Terms(
+        tuple(f"direction {s}" for s in part_series),
+        tuple(x.sensors[o // 3] for o in part_output),
+        ("nT",) * (outputs * k),
+        series,
+        np.arange(outputs * k),
+        part_output,
+        part_series,
+    )
 
 
 def common_waveform(state: State, record: Record) -> Waveform | None:
