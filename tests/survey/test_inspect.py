@@ -39,7 +39,7 @@ def test_a_canonical_file_needs_no_mapping(tmp_path: Path, registered: dict[str,
     write_canonical(Survey.build(array_variables()), tmp_path / "s.nc")
     facts = describe(tmp_path / "s.nc", registered)
     assert facts.canonical
-    assert yaml.safe_load(facts.mapping) == {"survey": {"file": "s.nc"}}
+    assert yaml.safe_load(facts.mapping) == {"survey": {"file": str(tmp_path / "s.nc")}}
     by_name = {c.name: c for c in facts.columns}
     assert by_name["b_raw"].shape == (400, 4, 3)
     assert by_name["b_raw"].dims == ("time", "sensor", "axis")
@@ -100,6 +100,45 @@ def test_a_table_without_names_by_its_content(tmp_path: Path, registered: dict[s
     assert np.median(magnitude) == pytest.approx(50_000, rel=0.02)
 
 
+def test_a_time_with_its_unit_in_the_header(tmp_path: Path, registered: dict[str, Any]) -> None:
+    table = np.column_stack([np.arange(N) * 0.5, field() / 1000, np.full(N, 48_000.0)])
+    np.savetxt(tmp_path / "a.csv", table, delimiter=";", header="t (s);Bx (uT);By (uT);Bz (uT);F (nT)", comments="")
+    survey = pasted(describe(tmp_path / "a.csv", registered), tmp_path, registered)
+    np.testing.assert_array_equal(survey.time, table[:, 0])
+    assert "t_s" not in survey.paths()
+
+
+def test_a_date_and_a_clock_are_one_time(tmp_path: Path, registered: dict[str, Any]) -> None:
+    rows = [f"2024-05-05,10:{i // 60:02d}:{i % 60:02d},{x},{y},{z}" for i, (x, y, z) in enumerate(field())]
+    (tmp_path / "a.csv").write_text("date,time,mag_x,mag_y,mag_z\n" + "\n".join(rows) + "\n")
+    survey = pasted(describe(tmp_path / "a.csv", registered), tmp_path, registered)
+    np.testing.assert_array_equal(survey.time - survey.time[0], np.arange(N))
+
+
+def test_an_array_and_a_base_station_with_their_own_clocks(tmp_path: Path, registered: dict[str, Any]) -> None:
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["base/t"], file["base/F"] = np.arange(30) * 2.0, np.full(30, 48_000.0)
+        file["rec/clock"], file["rec/mag"] = np.arange(N) * 0.1, np.hstack([field(1), field(2)])
+    survey = pasted(describe(tmp_path / "a.h5", registered), tmp_path, registered)
+    np.testing.assert_array_equal(survey.values("b_raw"), np.stack([field(1), field(2)], axis=1))
+    np.testing.assert_array_equal(survey.values("reference/time"), np.arange(30) * 2.0)
+
+
+def test_the_layout_without_an_epoch_gets_a_mapping(tmp_path: Path, registered: dict[str, Any]) -> None:
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["time"], file["b_raw"] = np.arange(N) * 0.1, np.stack([field(1), field(2)], axis=1)
+        file["time"].attrs["units"], file["b_raw"].attrs["units"] = "s", "nT"
+    facts = describe(tmp_path / "a.h5", registered)
+    assert not facts.canonical
+    assert pasted(facts, tmp_path, registered).values("b_raw").shape == (N, 2, 3)
+
+
+def test_a_file_that_is_not_there_is_told_once(tmp_path: Path, registered: dict[str, Any]) -> None:
+    with pytest.raises(DataError, match="there is no such file") as told:
+        describe(tmp_path / "a.weird", registered)
+    assert str(told.value).count("no such file") == 1
+
+
 def test_a_column_called_y_survives_yaml(tmp_path: Path, registered: dict[str, Any]) -> None:
     np.savetxt(
         tmp_path / "a.csv", np.column_stack([np.arange(N), field()]), delimiter=",", header="t,x,y,z", comments=""
@@ -132,4 +171,5 @@ def test_show_prints_columns_and_mapping(tmp_path: Path, capsys: pytest.CaptureF
     printed = capsys.readouterr().out
     assert "bx [nT]" in printed
     mapping = printed[printed.index("survey:") :]
+    assert str(tmp_path / "a.csv") in mapping
     assert yaml.safe_load(mapping)["survey"]["sensors"]["S1"]["from"] == ["bx [nT]", "by [nT]", "bz [nT]"]

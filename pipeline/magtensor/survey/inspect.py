@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -14,7 +15,8 @@ from magtensor.errors import DataError, UsageError
 from magtensor.survey import checks
 from magtensor.survey.sections import SurveySection
 from magtensor.survey.source import Source
-from magtensor.survey.tables import Column, Tables
+from magtensor.survey.tables import Column, Tables, existing
+from magtensor.survey.times import split_since
 
 if TYPE_CHECKING:
     from magtensor.components import Component
@@ -55,7 +57,7 @@ class FileFacts:
     Attributes:
         files: names.
         reader: which reader read it.
-        canonical: it has `time` and `b_raw` of the canonical layout.
+        canonical: it has `time` and `b_raw` of the canonical layout, with their units.
         columns: in the file's order.
         attributes: what the file says of itself.
         notes: what the reader noticed.
@@ -89,8 +91,8 @@ def describe(file: Path, readers: Mapping[str, Component], reader: str | None = 
 
     name, tables = _read(file, readers, reader)
     facts = tuple(column_facts(n, c, i) for i, (n, c) in enumerate(tables.columns.items()))
-    raw = tables.columns.get("b_raw")
-    canonical = "time" in tables.columns and raw is not None and len(raw.shape) == 3
+    raw, time = tables.columns.get("b_raw"), tables.columns.get("time")
+    canonical = raw is not None and len(raw.shape) == 3 and bool(raw.units) and time is not None and _dated(time)
     return FileFacts(
         tuple(f.name for f in tables.files),
         name,
@@ -99,8 +101,16 @@ def describe(file: Path, readers: Mapping[str, Component], reader: str | None = 
         tables.attributes,
         tables.notes,
         tuple(sampling_sentences(tables)),
-        propose(tables, file.name, name if reader or not _by_suffix(file, readers) else None, canonical=canonical),
+        propose(tables, str(file), name if reader or not _by_suffix(file, readers) else None, canonical=canonical),
     )
+
+
+def _dated(time: Column) -> bool:
+    """The units of the times name an epoch, without which the canonical layout is refused."""
+    try:
+        return split_since(time.units or "") is not None
+    except ValueError:
+        return False
 
 
 def _by_suffix(file: Path, readers: Mapping[str, Component]) -> list[str]:
@@ -109,6 +119,7 @@ def _by_suffix(file: Path, readers: Mapping[str, Component]) -> list[str]:
 
 def _read(file: Path, readers: Mapping[str, Component], reader: str | None) -> tuple[str, Tables]:
     """The file through the named reader, the one its ending names, or the first that understands it."""
+    existing([file])
     candidates = [reader] if reader else _by_suffix(file, readers) or list(readers)
     failures = []
     for name in candidates:
@@ -197,13 +208,12 @@ def show(file: Path, reader: str | None = None) -> None:
     from magtensor.registry import Registry
 
     facts = describe(file, readers_of(Registry.load()), reader)
-    console = Console()
+    console = Console() if sys.stdout.isatty() else Console(width=200)  # a file or a pipe has no edge to wrap at
     console.print(f"[bold]{', '.join(facts.files)}[/bold]  (reader {facts.reader})", highlight=False)
     table = Table(box=None, pad_edge=False)
     for title in ("", "name", "shape", "units", "lowest", "median", "highest", "missing", "step"):
-        table.add_column(
-            title, justify="right" if title in ("lowest", "median", "highest", "missing", "step") else "left"
-        )
+        number = title in ("lowest", "median", "highest", "missing", "step")
+        table.add_column(title, justify="right" if number else "left", no_wrap=number, overflow="fold")
     for c in facts.columns:
         shape = " x ".join(
             str(n) if not c.dims else f"{d} {n}" for n, d in zip(c.shape, c.dims or c.shape, strict=True)

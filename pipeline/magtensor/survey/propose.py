@@ -21,7 +21,7 @@ from magtensor.survey.vectors import Floats, Triple, candidates, column_values, 
 from magtensor.units import UnitError, canonical_unit, convert, dimension, is_unit
 
 _TIME_NAMES = re.compile(
-    r"^(time|t|timestamp|epoch|unix|date.?time|utc|seconds?|secs?|millis|t_\w+|time_\w+)$", re.IGNORECASE
+    r"^(times?|t|timestamps?|clock|epoch|unix|date.?time|utc|seconds?|secs?|millis|t_\w+|time_\w+)$", re.IGNORECASE
 )
 _MAGNETIC = re.compile(r"mag|b_|^b\d?_?[xyz]|field|flux|fgm|compass|fluxgate|^h[xyz]", re.IGNORECASE)
 _SCALAR = re.compile(
@@ -57,7 +57,7 @@ def propose(tables: Tables, file: str, reader: str | None, *, canonical: bool) -
 
     Args:
         tables: the file.
-        file: its name.
+        file: its path, as it shall stand in the recipe.
         reader: to be named in the recipe; None where the file's ending names it.
         canonical: the file needs no mapping.
     """
@@ -105,7 +105,7 @@ def time_candidates(tables: Tables) -> Iterator[tuple[Column, Floats]]:
     for name, column in tables.columns.items():
         if len(column.shape) != 1 or name != column.name:  # a reader may give one column a second name
             continue
-        name = name.rsplit("/", 1)[-1]
+        name = re.sub(r"\s*[(\[].*[)\]]$", "", name.rsplit("/", 1)[-1])  # `t (s)` is called t
         named = bool(_TIME_NAMES.match(name))
         try:
             stated = column.units is not None and (split_since(column.units) is not None)
@@ -148,8 +148,13 @@ def _unix_unit(values: NDArray[Any]) -> str | None:
     return next((unit for unit, low, high in _UNIX_SCALES if low < middle < high), None)
 
 
+def _weight(tables: Tables, rows: int) -> int:
+    """How many numbers a row holds in all columns of so many rows: an array has more of them than a base station."""
+    return sum(int(np.prod(c.shape[1:])) for c in tables.columns.values() if c.shape and c.shape[0] == rows)
+
+
 def _time(tables: Tables, guess: _Guess) -> None:
-    for column, seconds in time_candidates(tables):
+    for column, seconds in sorted(time_candidates(tables), key=lambda found: -_weight(tables, len(found[1]))):
         guess.used.add(column.name)
         own = column.name == "time" and column.units is not None and split_since(column.units) is not None
         if own:
@@ -165,16 +170,28 @@ def _time(tables: Tables, guess: _Guess) -> None:
         if not moves_on(seconds).all():
             guess.rest.append("# times repeat or step back: the stage load needs `time_faults: drop`")
         return
-    for column in tables.columns.values():
-        if column.text and len(column.shape) == 1 and column.shape[0] and _is_instant(str(column.load()[0])):
-            guess.used.add(column.name)
-            guess.time.append(f"  time: {{from: {_quoted(column.name)}}}")
-            return
+    for names in _instants(tables):
+        guess.used |= set(names)
+        guess.time.append(f"  time: {{from: {_refs(names)}}}")
+        return
     for name, value in tables.attributes.items():
         if "rate" in str(name).lower() and isinstance(value, int | float) and value > 0:
             guess.time.append(f"  time: {{rate_Hz: {_quoted(str(name))}}}  # an attribute of the file: {value:.6g}")
             return
     guess.time.append("  time: {rate_Hz: 10}  # no time column was found: put the right rate here")
+
+
+def _instants(tables: Tables) -> Iterator[tuple[str, ...]]:
+    """Text columns that are ISO 8601 times: one of them, or a date and a clock."""
+    texts = {c.name: c.load() for c in tables.columns.values() if c.text and len(c.shape) == 1 and c.shape[0]}
+    for date, days in texts.items():
+        if not _is_instant(str(days[0])):
+            continue
+        for clock, hours in texts.items():
+            if clock != date and len(hours) == len(days) and _is_instant(f"{days[0]} {hours[0]}"):
+                yield date, clock
+        if len(days) < 2 or days[0] != days[1]:
+            yield (date,)
 
 
 def _is_instant(text: str) -> bool:
@@ -310,9 +327,31 @@ def _scalars(tables: Tables, rows: int, guess: _Guess) -> None:
             if units is None or dimension(units) != dimension(needed):
                 entry = f"from: {_quoted(column.name)}, units: {needed}"
         guess.channels.append(f"    {name}: {{{entry}}}")
+    reference = reference or _other_reference(tables, rows, guess)
     if not reference:
         guess.rest.append("  # a total field is needed to calibrate against, for instance:")
         guess.rest.append("  # reference: {constant: {value: 50000, units: nT, why: ...}}")
+
+
+def _other_reference(tables: Tables, rows: int, guess: _Guess) -> bool:
+    """A total field with a time base of its own in the same file."""
+    for clock, seconds in time_candidates(tables):
+        if len(seconds) == rows:
+            continue
+        for column in tables.columns.values():
+            values = numbers_of(column) if column.shape == clock.shape and column.name != clock.name else None
+            if values is None or not (units := _total_field_units(values, _stated_units(column.name, column.units))):
+                continue
+            stated = _time_units(clock, clock.load())
+            entry = f"from: {_quoted(clock.name)}" + ("" if clock.units else f", units: {stated or 's'}")
+            entry += ", epoch: unix" if not clock.units and _unix_unit(clock.load()) else ""
+            guess.rest += [
+                "  reference:",
+                f"    time: {{{entry}}}",
+                f"    total_field: {{from: {_quoted(column.name)}, units: {units}}}",
+            ]
+            return True
+    return False
 
 
 def _total_field_units(values: Floats, units: str | None) -> str | None:
