@@ -39,10 +39,12 @@ def held_out_error(
     reference = np.full(n, np.nan)
     edges = np.linspace(0, n, FOLDS + 1).round().astype(int)
     for k in range(FOLDS):
-        test = np.arange(edges[k], edges[k + 1])
-        train = np.setdiff1d(np.arange(n), test)
+        test = slice(edges[k], edges[k + 1])
+        train = np.array(keep)
+        train[test] = False
         try:
-            state = joint_state(record.at(train), adopted, how, start, keep=keep[train])
+            # the whole record makes the regressors: a lag remembers what went on while the test samples were taken
+            state = joint_state(record, adopted, how, start, keep=train)
         except NotEnoughData:
             return None
         x = excitation_of(record, state.fit)
