@@ -273,3 +273,14 @@ def test_as_the_user_sees_it(tmp_path: Path, small: bytes) -> None:
     assert done.stdout == ""
     assert done.stderr.startswith("error: cut.nc: the HDF5 file is truncated")
     assert "Traceback" not in done.stderr
+
+
+def test_a_text_attribute_turned_into_a_sequence(bench: Any, contents: Contents, tmp_path: Path) -> None:
+    """One damaged byte in an attribute's type did this to a survey, and the HDF5 library read beyond its memory."""
+    path = contents.write(tmp_path / "turned.nc")
+    with h5py.File(path, "a") as file:
+        del file["b_raw"].attrs["long_name"]
+        sequence = np.empty(1, dtype=object)
+        sequence[0] = np.array([1, 2], dtype="i4")
+        file["b_raw"].attrs.create("long_name", sequence, dtype=h5py.vlen_dtype("i4"))
+    bench("joint", path).succeeded()
