@@ -21,11 +21,11 @@ from magtensor.loop.search import Search
 from magtensor.loop.spectrum import spectral_lines
 from magtensor.loop.terms import Terms
 
-ALPHA = 0.005  # of each of the tests
-SURROGATES = 199
+ALPHA = 0.002  # of each of the tests
+SURROGATES = 999
 BINS = 120  # the common waveform is looked for in means of so many stretches
 NOISE = "what is left is noise: white, and slow noise of each sensor alone"
-LEAST_T = 3.0  # paired t over folds of what the direction predicts
+LEAST_T = 4.5  # one in a thousand by chance: paired t over folds of what the direction predicts
 LEAST_FOR_DIRECTION = 60  # samples for each output, at least, before its own polynomial can be asked for
 MOST_LAG = 0.1  # of the survey, in which a channel is compared with the waveform
 
