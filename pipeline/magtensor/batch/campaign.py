@@ -20,7 +20,8 @@ from magtensor.batch.process import ERROR_FILE, KINDS, Outcome, Task
 from magtensor.batch.runners import DaskRunner, LocalRunner, Runner
 from magtensor.batch.surveys import Wanted, folder_names, wanted_surveys
 from magtensor.errors import BatchFailed, UsageError
-from magtensor.recipe.plan import Plan, override, plan
+from magtensor.recipe.overrides import override
+from magtensor.recipe.plan import Plan, plan
 from magtensor.recipe.source import Document, load_yaml
 from magtensor.registry import Registry
 from magtensor.result import RESULT

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from magtensor.atomic import refuse_overwriting, require_writable
-from magtensor.recipe.plan import override
+from magtensor.recipe.overrides import override
 from magtensor.recipe.problems import Problems
 from magtensor.recipe.source import load_yaml
 
