@@ -157,6 +157,8 @@ def _names(tables: Tables, count: int) -> NDArray[Any]:
 def _axes(tables: Tables) -> NDArray[Any]:
     if "axis" in tables.columns:
         column = tables.find("axis")
+        if column.shape != (3,):
+            raise DataError(f"shape {column.shape} is not (axis) = (3,)", where=column.origin)
         found = [str(v).strip().lower() for v in np.atleast_1d(column.load()).tolist()]
         # Whoever writes the axis as bare numbers has named nothing; the layout's order holds.
         if column.text and found != list(AXES):
