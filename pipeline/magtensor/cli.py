@@ -129,15 +129,29 @@ def inspect(file: Path, reader: str | None) -> None:
 
 @cli.command()
 @click.option("--json", "as_json", is_flag=True, help="Print as JSON, option schemas included.")
-@click.argument("name", required=False)
+@click.argument("words", nargs=-1, metavar="[[check] NAME]")
 @plugins_option
-def plugins(as_json: bool, name: str | None, plugin_folders: tuple[Path, ...]) -> None:
-    """List every plugin and what it gives; with NAME, one stage, method, reader or metric in full."""
+def plugins(as_json: bool, words: tuple[str, ...], plugin_folders: tuple[Path, ...]) -> None:
+    """List every plugin and what it gives; NAME shows one component in full.
+
+    `magtensor plugins check NAME` tries an error model: its declarations, units, determinism, and what it does on
+    surveys of several kinds.
+    """
     from magtensor.listing import describe, show_one, show_plugins
     from magtensor.registry import Registry
 
+    if len(words) > 2 or (len(words) == 2 and words[0] != "check"):
+        raise click.UsageError("give a NAME, or `check NAME`")
+    name = words[-1] if words else ""
     registry = Registry.load(plugin_folders)
-    if as_json:
+    if len(words) == 2:
+        from magtensor.errors import UsageError
+        from magtensor.loop.checker import check_error_model
+
+        if faults := check_error_model(registry.find("error_model", name)):
+            raise UsageError("\n".join(f"{name}: {fault}" for fault in faults))
+        click.echo(f"{name}: nothing to complain about")
+    elif as_json:
         click.echo(json.dumps(describe(registry), indent=2))
     elif name:
         show_one(registry, name)

@@ -19,6 +19,7 @@ from .factors import upper
 from .quadric import ellipsoid_restricted, fit_ellipsoid
 from .types import Array
 
+START_SAMPLES = 20_000  # the algebraic fit is only where the iteration begins
 _CHUNK = 65536
 _UPPER = np.array([(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)])
 
@@ -76,7 +77,8 @@ def fit_scalar(y: Array, total_field: Array, reference_noise: float = 0.0, most_
     ------
     NotEnoughData: the algebraic fit is no ellipsoid, the normal equations are singular, or it does not converge.
     """
-    found = fit_ellipsoid(y, total_field, ellipsoid_restricted)
+    thin = slice(None, None, max(1, len(y) // START_SAMPLES))
+    found = fit_ellipsoid(y[thin], total_field[thin], ellipsoid_restricted)
     p = np.concatenate([upper(found.shape)[_UPPER[:, 0], _UPPER[:, 1]], found.offset])
     cost = _cost(p, y, total_field, reference_noise)
     damping = 0.0
