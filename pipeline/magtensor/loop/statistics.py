@@ -98,31 +98,38 @@ def family_p(g: Grams, sensors: Sequence[str], subset: Sequence[int] | None = No
         if 3 * len(chosen) <= count:
             found.append(wald_p(part, chosen))
             continue
-        fitting = [wald_p(part, group) for group in groups if 3 * len(group) <= count]
+        fitting = [wald_p(part, group, alone=chosen) for group in groups if 3 * len(group) <= count]
         if len(fitting) == len(groups) > 1:
             found.append(cauchy_combination(fitting))
     return max(found, default=1.0)
 
 
-def wald_p(g: Grams, chosen: Sequence[int]) -> float:
-    """P value that the chosen coefficients are zero, the others free: delete-block jackknife (CR3), Hotelling's F."""
+def wald_p(g: Grams, chosen: Sequence[int], alone: Sequence[int] = ()) -> float:
+    """P value that the chosen coefficients are zero, the others free: delete-block jackknife (CR3), Hotelling's F.
+
+    Parameters
+    ----------
+    alone: coefficients that are not free but zero where they are not chosen. A family whose part common to all sensors
+        cannot be seen says nothing of one sensor as long as the other sensors' coefficients are free.
+    """
     from scipy.stats import f as f_distribution
 
     count = len(g.zz)
     subset = np.asarray(chosen, dtype=int)
     scale = own_information(g)
-    full_n, full_y = _without_others(*normal(g.total()), subset, scale)
+    others = np.setdiff1d(np.arange(g.count), [*chosen, *alone])
+    full_n, full_y = _without_others(*normal(g.total()), subset, others, scale)
     basis, _ = _directions(full_n[0], scale[subset])
     p = basis.shape[1]
     if p == 0 or p >= count:
         return 1.0
-    information = basis.T @ full_n[0] @ basis
-    theta = np.linalg.solve(information, basis.T @ full_y[0])
-    unit = np.sqrt(np.diag(information))
-    n, y = _without_others(*normal(g.without_each()), subset, scale)
+    n, y = _without_others(*normal(g.without_each()), subset, others, scale)
+    basis = _confirmed(basis @ np.linalg.inv(np.linalg.cholesky(basis.T @ full_n[0] @ basis)).T, n)
+    p = basis.shape[1]
+    if p == 0:
+        return 1.0  # single blocks hold nearly all there is to know: nothing can confirm it
+    theta = np.linalg.solve(basis.T @ full_n[0] @ basis, basis.T @ full_y[0])
     small, right = basis.T @ n @ basis, y @ basis
-    if np.linalg.eigvalsh(small / np.outer(unit, unit))[:, 0].min() < LEAST_LEFT:
-        return 1.0  # a single block holds nearly all there is to know: nothing can confirm it
     spread = np.linalg.solve(small, right[:, :, None])[:, :, 0] - theta
     covariance = (count - 1) / count * spread.T @ spread
     try:
@@ -132,11 +139,29 @@ def wald_p(g: Grams, chosen: Sequence[int]) -> float:
     return float(f_distribution.sf((count - p) / (p * (count - 1)) * t2, p, count - p))
 
 
-def _without_others(n: Array, y: Array, chosen: NDArray[np.int_], scale: Array) -> tuple[Array, Array]:
-    """Project the coefficients that were not chosen off a batch of normal equations."""
-    others = np.setdiff1d(np.arange(len(scale)), chosen)
+def _confirmed(basis: Array, n: Array) -> Array:
+    """The directions of a basis (with unit information in all blocks together) that no single block is needed for.
+
+    Parameters
+    ----------
+    basis: (P, p).
+    n: (B, P, P), the information without each block.
+    """
+    values, vectors = np.linalg.eigh(basis.T @ n @ basis)
+    lost = vectors.transpose(0, 2, 1)[values < LEAST_LEFT]
+    if not len(lost):
+        return basis
+    _, s, vt = np.linalg.svd(lost, full_matrices=True)
+    rank = int(np.sum(s > 0.1 * s[0]))
+    return basis @ vt[rank:].T
+
+
+def _without_others(
+    n: Array, y: Array, chosen: NDArray[np.int_], others: NDArray[np.int_], scale: Array
+) -> tuple[Array, Array]:
+    """The chosen coefficients' part of a batch of normal equations, the others projected off."""
     if not len(others):
-        return n, y
+        return n[:, chosen[:, None], chosen], y[:, chosen]
     root = np.sqrt(np.maximum(scale, 1e-300))
     n, y = n / np.outer(root, root), y / root
     own = np.linalg.pinv(n[:, others[:, None], others], rcond=1e-8, hermitian=True)
