@@ -279,10 +279,10 @@ def test_shapes(shape: str, count: int) -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"rate_hz": 5.0}, r"unknown key 'rate_hz' \(did you mean rate_Hz"),
+        ({"rate_hz": 5.0}, r"rate_hz: unknown key \(did you mean rate_Hz"),
         (
             {"motion": {"type": "tumbling", "duration": 5.0}},
-            r"motion: unknown key 'duration' \(did you mean duration_s",
+            r"motion.duration: unknown key \(did you mean duration_s",
         ),
         ({"motion": {"type": "tumbling"}}, "motion: needs 'duration_s'"),
         ({"motion": {"type": "tumble"}}, "'tumbling'"),
