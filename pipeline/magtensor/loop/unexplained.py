@@ -21,8 +21,8 @@ from magtensor.loop.search import Search
 from magtensor.loop.spectrum import spectral_lines
 from magtensor.loop.terms import Terms
 
-ALPHA = 0.002  # of each of the tests
-SURROGATES = 999
+ALPHA = 0.001  # of each of the tests
+SURROGATES = 1999
 BINS = 120  # the common waveform is looked for in means of so many stretches
 NOISE = "what is left is noise: white, and slow noise of each sensor alone"
 LEAST_T = 4.5  # one in a thousand by chance: paired t over folds of what the direction predicts
