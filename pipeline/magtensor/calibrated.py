@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from magtensor.calibration.types import ArrayCalibration
 from magtensor.errors import DataError
@@ -14,6 +15,8 @@ from magtensor.survey.model import AXES, Survey, Variable
 
 MATRIX_ENTRIES = tuple(f"matrix_{i}{j}" for i in AXES for j in AXES)
 OFFSET_ENTRIES = tuple(f"offset_{j}" for j in AXES)
+
+SAME_PLACE_M = 1e-3  # positions nearer than this are the same place: a gradient changes by this share of its baseline
 
 B = ("time", "sensor", "axis")
 
@@ -108,6 +111,28 @@ def require_sensors(survey: Survey, wanted: list[str], where: str) -> None:
             f"the calibration is for the sensors {', '.join(wanted)}, the survey has {', '.join(survey.sensors)}",
             where=where,
             hint="name the calibration that was made with these sensors, or rename them in the recipe's mapping",
+        )
+
+
+def require_positions(survey: Survey, wanted: NDArray[np.float64], where: str) -> None:
+    """A tensor is assembled with the places of the calibration's sensors; a survey that states others is refused.
+
+    Args:
+        survey: positions may be absent or NaN, then nothing is compared.
+        wanted: (S, 3) m.
+
+    Raises:
+        DataError: a sensor stands elsewhere.
+    """
+    if "position" not in survey:
+        return
+    apart = np.nan_to_num(np.linalg.norm(survey.values("position") - wanted, axis=1))
+    if apart.max() > SAME_PLACE_M:
+        worst = int(apart.argmax())
+        raise DataError(
+            f"sensor {survey.sensors[worst]} is {apart[worst]:.4g} m away from where it was when calibrated",
+            where=f"{where}: position",
+            hint="its tensor would be wrong: calibrate this array, or correct the positions",
         )
 
 

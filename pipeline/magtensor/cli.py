@@ -73,7 +73,9 @@ def apply(calibration: Path, survey: Path, output: Path | None) -> None:
     """Apply a stored CALIBRATION to another SURVEY."""
     from magtensor import session
 
-    click.echo(f"calibrated: {session.apply(calibration, survey, output)}")
+    applied = session.apply(calibration, survey, output)
+    click.echo(f"calibrated: {applied.file}")
+    click.echo(applied.sentence)
 
 
 @cli.command()

@@ -159,7 +159,7 @@ def with_declared_alone(calibrated: Survey) -> Survey:
 
 def apply_to(calibration: Survey, path: Path, planned: Plan, *, tolerant: bool = False) -> Survey:
     """Another survey, loaded as the recipe loads and corrected with a calibration; `tolerant` as in `load_as`."""
-    from magtensor.calibrated import corrected, require_sensors, restored
+    from magtensor.calibrated import corrected, require_positions, require_sensors, restored
     from magtensor.loop.stored import cleaned, stored_effects
     from magtensor.tensor.elements import five
     from magtensor.tensors import assembled, refined, refinement_noise, stored_assembly, stored_refinement
@@ -172,6 +172,7 @@ def apply_to(calibration: Survey, path: Path, planned: Plan, *, tolerant: bool =
         survey = cleaned(survey, fitted, *stored_effects(calibration, planned.registry))
         survey = survey.merged(corrected(fitted, survey))
         if "calibration/tensor_gain" in calibration:
+            require_positions(survey, calibration.values("calibration/position"), str(path))
             b, noise = survey.values("calibrated/b"), calibration.values("calibration/noise_std")
             position = calibration.values("calibration/position")
             assembly = stored_assembly(calibration)
@@ -219,16 +220,21 @@ def _fits(path: str, pattern: str) -> bool:
     return fnmatchcase(path, pattern)
 
 
-def apply(calibration: Path, survey: Path, output: Path | None = None) -> Path:
+@dataclass(frozen=True)
+class Applied:
+    """A calibrated survey that was written: its file, and how well the calibration fits it, in words."""
+
+    file: Path
+    sentence: str
+
+
+def apply(calibration: Path, survey: Path, output: Path | None = None) -> Applied:
     """Apply a stored calibration to another survey and write its `/calibrated` group.
 
     Args:
         calibration: `calibration.nc` or `result.nc`.
         survey: another survey of the same sensors, in the layout the recipe of the calibration reads.
         output: default: the survey's name with `.calibrated.nc`, beside it.
-
-    Returns:
-        The file written.
     """
     target = output or survey.with_name(f"{survey.stem}.calibrated.nc")
     refuse_overwriting([target], [survey, calibration])
@@ -243,4 +249,14 @@ def apply(calibration: Path, survey: Path, output: Path | None = None) -> Path:
         notes={**made_by.notes, "applied": "recipe and stages are the calibration's, the inputs are this file's"},
     )  # fmt: skip
     result.write_calibrated(target, found, applied)
-    return target
+    return Applied(target, fit_in_words(found))
+
+
+def fit_in_words(applied: Survey) -> str:
+    """How well a calibration fits the survey it was applied to: |b| against the survey's own total field."""
+    block = survey_block(applied)
+    figures = (block or {}).get("total_field_rms_nT")
+    if not figures or figures["all"] is None:
+        return "How well it fits cannot be told: this survey has no total field at its samples."
+    each = ", ".join(f"{name} {value:.3g}" for name, value in figures.items() if name != "all" and value is not None)
+    return f"|b| - F: {figures['all']:.3g} nT rms on this survey ({each})."

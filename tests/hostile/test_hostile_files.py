@@ -187,8 +187,9 @@ def test_a_result_is_no_survey(bench: Any, finished: Path, tmp_path: Path) -> No
         (lambda c: c.values.update(sensor=c.values["sensor"][::-1]), "the survey has S4, S3, S2, S1"),
         (lambda c: c.rows(slice(0, 1)), "single sample"),
         (lambda c: c.values.update(b_raw=c.b / 1e3), "looks like uT labelled nT"),
+        (lambda c: c.values.update(position=c.values["position"] * 1.5), "m away from where it was when calibrated"),
     ],
-    ids=["other names", "other order", "one sample", "other units"],
+    ids=["other names", "other order", "one sample", "other units", "other places"],
 )
 def test_apply_to_another_instrument(
     command: Any, finished: Path, contents: Contents, tmp_path: Path, change: Any, message: str

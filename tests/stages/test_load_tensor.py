@@ -80,7 +80,7 @@ def test_from_simulation_to_an_applied_calibration(tmp_path: Path) -> None:
     assert (tmp_path / "out" / "report.html").stat().st_size > 10_000
     import xarray as xr
 
-    written = apply(tmp_path / "out" / "calibration.nc", tmp_path / "line.h5")
+    written = apply(tmp_path / "out" / "calibration.nc", tmp_path / "line.h5").file
     with xr.open_dataset(written, group="calibrated", engine="h5netcdf", decode_times=False) as calibrated:
         tensor = calibrated["tensor"].values
         std = calibrated["tensor_std"].values
