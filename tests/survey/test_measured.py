@@ -22,16 +22,16 @@ pytestmark = pytest.mark.measured
 
 @pytest.fixture
 def measured(registered: dict[str, Any]) -> Any:
-    """Load the recording a recipe names, with the recipe's own options of `load`."""
+    """Load the recording a recipe names, with the recipe's own options of `load` (none of them for the whole)."""
 
-    def run(name: str, **changes: Any) -> Survey:
+    def run(name: str, *, whole: bool = False, **changes: Any) -> Survey:
         recipe = load_yaml(RECIPES / f"{name}.yaml").value
         section = SurveySection.model_validate_json(json.dumps({**recipe["survey"], **changes}))
         folder = (RECIPES / section.names[0]).parent
         if not folder.is_dir():
             pytest.skip(f"the recordings of {name} are not here")
         given = next(iter(recipe["stages"]))
-        options = given["load"] if isinstance(given, dict) else {}
+        options = given["load"] if isinstance(given, dict) and not whole else {}
         options = {k: tuple(v) if isinstance(v, list) else v for k, v in options.items()}
         return load(Survey(xr.DataTree(), source=Source(section, RECIPES, registered)), **options)
 
@@ -44,7 +44,7 @@ def magnitudes(survey: Survey) -> np.ndarray:
 
 
 def test_balloon(measured: Any) -> None:
-    survey = measured("balloon")
+    survey = measured("balloon", whole=True)
     assert survey.sensors == ["RM3100", "AK09916"]
     assert len(survey.time) == 43_470
     assert survey["time"].attrs["rate_Hz"] == pytest.approx(9.5, abs=0.1)
