@@ -1,0 +1,128 @@
+"""Surveys of the simulator for the loop, and the loop run on them as a user runs it."""
+
+from __future__ import annotations
+
+import copy
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magtensor.loop.model import Fitting, Record, State, joint_state
+from magtensor.loop.record import record_of
+from magtensor.session import run_recipe
+from magtensor.simulate import simulate, write
+
+Array = NDArray[np.float64]
+
+RECIPE = Path(__file__).parents[2] / "recipes" / "closed_loop.yaml"
+
+BASE: dict[str, Any] = {
+    "title": "test of the loop",
+    "seed": 1,
+    "rate_Hz": 4.0,
+    "instrument": {
+        "seed": 7,
+        "array": {"shape": "cross", "baseline_m": 0.5},
+        "errors": {"scale": 0.01, "non_orthogonality_deg": 0.5, "misalignment_deg": 1.0, "bias_nT": 100.0},
+        "noise": {"white_sd_nT": 0.15, "flicker_nT_per_rtHz": 0.01},
+    },
+    "motion": {"type": "tumbling", "duration_s": 1800.0, "rate_rms_deg_s": 15.0, "rate_time_s": 5.0},
+    "field": {
+        "earth": {"total_field_nT": 49500.0, "inclination_deg": 66.0, "declination_deg": 4.0},
+        "variation": {
+            "pulsations": [{"rms_nT": 2.0, "period_s": 60.0}],
+            "irregular": {"rms_nT": 10.0, "time_s": 300.0},
+        },
+    },
+    "base_station": {"rate_Hz": 0.5, "noise_sd_nT": 0.1, "resolution_nT": 0.01},
+    "channels": {
+        "temperature": {
+            "type": "temperature",
+            "trend_degC_per_h": 5.0,
+            "wander_rms_degC": 1.0,
+            "wander_time_s": 300.0,
+            "self_heating_degC": 4.0,
+            "tau_s": 240.0,
+            "log_noise": 0.02,
+        },
+        "current_heater": {"type": "switched", "levels": [0.0, 1.5], "mean_hold_s": 45.0, "log_noise": 0.005},
+    },
+    "truth": "effects",
+}
+
+
+def scenario(seed: int = 1, *effects: dict[str, Any], **changes: Any) -> dict[str, Any]:
+    """The survey of that seed, some sections replaced, with effects."""
+    return copy.deepcopy(BASE) | {"seed": seed, "effects": list(effects)} | changes
+
+
+def survey_file(folder: Path, description: dict[str, Any], name: str = "survey.h5") -> Path:
+    """The survey written as a user has it."""
+    path = folder / name
+    write(simulate(description), path)
+    return path
+
+
+def verdict_of(folder: Path, description: dict[str, Any], **options: Any) -> dict[str, Any]:
+    """What `magtensor run recipes/closed_loop.yaml` writes of a survey."""
+    path = survey_file(folder, description)
+    run_recipe(RECIPE, folder / "result", survey=path, **options)
+    found: dict[str, Any] = json.loads((folder / "result" / "verdict.json").read_text())
+    return found
+
+
+def adopted_names(verdict: dict[str, Any]) -> set[str]:
+    """Names of what was adopted."""
+    return {a["error_model"] for a in verdict["adopted"]}
+
+
+def suspects(verdict: dict[str, Any]) -> set[str]:
+    """Names of what was adopted, and of what the survey does not tell from it."""
+    return adopted_names(verdict) | {n for a in verdict["adopted"] for n in a["indistinguishable_from"]}
+
+
+def loaded(folder: Path, description: dict[str, Any]) -> Record:
+    """The record of a survey as the loop sees it."""
+    from magtensor.recipe.plan import read_plan
+    from magtensor.session import load_as
+
+    path = survey_file(folder, description)
+    return record_of(load_as(read_plan(RECIPE, survey=path), path))
+
+
+def linear_state(record: Record) -> State:
+    """The joint fit with the linear model alone."""
+    return joint_state(record, [], Fitting())
+
+
+def synthetic(
+    seed: int, samples: int = 1200, sensors: int = 4, noise_nT: float = 1.0, added: Array | None = None
+) -> Record:
+    """A record drawn here, one sample a second: random attitudes, white noise and `added` (N, S, 3) nT."""
+    rng = np.random.default_rng(seed)
+    u = rng.standard_normal((samples, 3))
+    total = 50_000.0 + 10.0 * np.sin(np.arange(samples) / 90.0)
+    field = u / np.linalg.norm(u, axis=1, keepdims=True) * total[:, None]
+    forward = np.eye(3) + 0.01 * rng.standard_normal((sensors, 3, 3))
+    raw = np.einsum("sij,nj->nsi", forward, field) + 100.0 * rng.standard_normal((sensors, 3))
+    raw = raw + noise_nT * rng.standard_normal(raw.shape) + (0.0 if added is None else added)
+    time = np.arange(samples, dtype=float)
+    return Record(
+        time=time,
+        start=0.0,
+        raw=raw,
+        total_field=total,
+        quiet_field=total,
+        sensors=tuple(f"S{i + 1}" for i in range(sensors)),
+        logged={},
+        means={},
+        units={},
+        run=np.zeros(samples, dtype=int),
+        segment=np.zeros(samples, dtype=int),
+        position=None,
+        attitude=None,
+        samples=np.arange(samples),
+    )

@@ -1,0 +1,169 @@
+"""Colour, significance, lines and waveforms on noise whose nature is known."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from loop_cases import Array, linear_state, synthetic
+from scipy.stats import kstest
+
+from magtensor.loop.assessment import block_count, colours_of
+from magtensor.loop.colour import Colour, colour_of
+from magtensor.loop.evidence import grams
+from magtensor.loop.model import Record, State, quieted
+from magtensor.loop.screening import ALPHA
+from magtensor.loop.spectrum import spectral_lines
+from magtensor.loop.statistics import Gain, cauchy_combination, family_p, wald_p
+from magtensor.loop.unexplained import common_waveform
+
+WHITE = Colour(None, 1.0)
+
+
+def flicker(rng: np.random.Generator, shape: tuple[int, ...], crossing: float = 0.02) -> Array:
+    """White noise of unit variance plus 1/f noise as strong at the frequency `crossing` (cycles a sample)."""
+    n = shape[0]
+    f = np.fft.rfftfreq(2 * n)
+    f[0] = f[1]
+    spectrum = np.fft.rfft(rng.standard_normal((2 * n, *shape[1:])), axis=0)
+    slow = np.fft.irfft(spectrum * np.sqrt(crossing / f).reshape(-1, *[1] * (len(shape) - 1)), axis=0)[:n]
+    return slow + rng.standard_normal(shape)
+
+
+@pytest.mark.parametrize("stiff", [False, True])
+@pytest.mark.parametrize("crossing", [0.0, 0.01, 0.1])
+def test_the_filter_makes_coloured_noise_white(crossing: float, stiff: bool) -> None:
+    series = flicker(np.random.default_rng(2), (8192, 9), crossing)
+    white = colour_of(series, stiff=stiff).whiten(series)
+    spectrum = np.mean(np.abs(np.fft.rfft(white - white.mean(axis=0), axis=0)) ** 2, axis=1)[1:] / len(series)
+    edges = np.geomspace(2, len(spectrum), 14).astype(int)
+    for a, b in pairwise(edges):
+        # a mean of exponentials; the smooth law itself is within a tenth
+        assert spectrum[a:b].mean() == pytest.approx(1.0, abs=0.12 + 4 / np.sqrt(9 * (b - a)))
+    assert white.var() == pytest.approx(1.0, abs=0.05)
+
+
+def test_the_filter_keeps_white_noise_as_it_is() -> None:
+    series = 3.0 * np.random.default_rng(3).standard_normal((4096, 6))
+    colour = colour_of(series)
+    assert colour.white == pytest.approx(9.0, rel=0.05)
+    assert colour.power is None or colour.power.max() < 2.0
+
+
+def test_combined_probability() -> None:
+    assert cauchy_combination([0.03, 0.03, 0.03]) == pytest.approx(0.03, rel=1e-9)
+    assert cauchy_combination([1e-9, 0.5, 0.4, 0.7]) == pytest.approx(4e-9, rel=0.01)  # Bonferroni's for one small p
+    assert 0 < cauchy_combination([1e-250, 0.9]) < 1e-200
+    draws = np.random.default_rng(5).uniform(size=(4000, 5))
+    assert kstest([cauchy_combination(row) for row in draws], "uniform").pvalue > 0.001
+
+
+def p_values(slow: bool, count: int, samples: int = 960) -> Array:
+    """P values of a slow offset, a slow scale and a fast offset on clean surveys."""
+    found = []
+    t = np.linspace(-1, 1, samples)
+    for seed in range(count):
+        rng = np.random.default_rng(10_000 + seed)
+        added = 2.0 * flicker(rng, (samples, 4, 3)) if slow else None
+        record = synthetic(seed, samples, added=added)
+        state = linear_state(record)
+        colours = colours_of(state.residual)
+        x = state.excitation
+        for terms in (
+            x.offsets(t, "nT"),
+            x.scales(1e-5 * np.sin(4 * t + seed), "1"),
+            x.offsets(np.sign(np.sin(200 * t)), "nT"),
+        ):
+            blocks = grams(
+                state.residual, terms.at(state.residual.samples), colours.across, colours.along,
+                block_count(len(state.residual.affine)),
+            )  # fmt: skip
+            found.append((wald_p(blocks, range(terms.count)), family_p(blocks, terms.sensors)))
+    return np.array(found)
+
+
+def test_significance_is_uniform_on_white_noise() -> None:
+    p = p_values(slow=False, count=40)
+    assert kstest(p[:, 0], "uniform").pvalue > 0.001
+    assert kstest(p[:, 1], "uniform", alternative="greater").pvalue > 0.001  # the largest of several: never liberal
+
+
+def test_slow_noise_does_not_pass_for_effects() -> None:
+    drift, scale, fast = p_values(slow=True, count=40)[:, 1].reshape(-1, 3).T
+    assert np.mean(scale < 0.05) < 0.15
+    assert np.mean(fast < 0.05) < 0.15
+    # a straight drift is what 1/f noise looks like: METHODS A2 has 20 to 27 % below .05 and leaves such families to
+    # the correction for the number of models and to the gate of held-out blocks. Unwhitened it is nearly all.
+    assert np.mean(drift < 0.05) < 0.6
+    assert np.mean(drift < ALPHA / 50) < 0.03
+
+
+def test_a_gain_in_one_fold_alone_is_not_consistent() -> None:
+    even = Gain(np.full(10, 100.0), np.full(10, 99.0) + 0.1 * np.arange(10), np.full(10, 50.0))
+    assert even.consistent and even.total == pytest.approx(5.5)
+    after = np.full(10, 100.5)
+    after[3] = 20.0
+    assert not Gain(np.full(10, 100.0), after, np.full(10, 50.0)).consistent
+
+
+def test_a_reference_without_its_noise() -> None:
+    rng = np.random.default_rng(6)
+    n = 1000
+    field = 50_000.0 + 20.0 * np.sin(np.arange(n) / 100.0) + 0.02 * np.arange(n)
+    noisy = field + 0.5 * rng.standard_normal(n)
+    quiet = quieted(noisy)
+    assert np.std(quiet - field) < 0.35 * 0.5
+    assert np.ptp(quieted(50_000.0 + 0.5 * rng.standard_normal(n))) < 0.5  # ptp of the noise: 3.3
+    np.testing.assert_allclose(quieted(field), field, atol=0.05)
+
+
+def with_line(seed: int, amplitude: float, frequency: float = 0.083) -> tuple[State, Record]:
+    samples = 2400
+    rng = np.random.default_rng(100 + seed)
+    tone = np.sin(2 * np.pi * frequency * np.arange(samples) + 0.4)
+    added = amplitude * tone[:, None, None] * rng.standard_normal((4, 3))
+    record = synthetic(seed, samples, added=added + 0.5 * flicker(rng, (samples, 4, 3)))
+    return linear_state(record), record
+
+
+def test_a_line_is_found_and_noise_has_none() -> None:
+    state, record = with_line(1, 0.3)
+    frequency, rms, p = spectral_lines(state.residual, record.time)[0]
+    assert frequency == pytest.approx(0.083, abs=1 / 2400)
+    assert p < 1e-6
+    assert 0.1 < rms < 0.35  # 0.3 / sqrt 2, a fourth of it common to all sensors
+    small = [spectral_lines(*_of(seed))[0][2] for seed in range(20)]
+    assert np.mean(np.array(small) < 0.05) <= 0.2
+    assert min(small) > 1e-4
+
+
+def _of(seed: int) -> tuple:
+    state, record = with_line(seed, 0.0)
+    return state.residual, record.time
+
+
+def test_a_common_waveform_is_found_and_independent_noise_has_none() -> None:
+    samples = 2400
+    wave = np.sin(np.arange(samples) / 70.0) * np.cos(np.arange(samples) / 411.0)
+    direction = np.random.default_rng(1).standard_normal((4, 3))
+    record = synthetic(2, samples, added=1.5 * wave[:, None, None] * direction)
+    found = common_waveform(linear_state(record), record)
+    assert found is not None and found.p < 0.01
+    assert abs(np.corrcoef(found.values, np.interp(found.time, record.time, wave))[0, 1]) > 0.95
+    contrast = 1.5 * (direction - direction.mean(axis=0)) * wave.std()
+    cosine = np.sum(found.direction * contrast) / np.linalg.norm(found.direction) / np.linalg.norm(contrast)
+    assert abs(cosine) > 0.9
+    ps = []
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        clean = synthetic(20 + seed, samples, added=flicker(rng, (samples, 4, 3)))
+        other = common_waveform(linear_state(clean), clean)
+        assert other is not None
+        ps.append(other.p)
+    assert np.sum(np.array(ps) <= 0.02) <= 1 and np.median(ps) > 0.15
+
+
+def test_one_sensor_has_no_waveform_in_common() -> None:
+    record = synthetic(3, 1200, sensors=1)
+    assert common_waveform(linear_state(record), record) is None
