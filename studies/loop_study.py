@@ -82,7 +82,7 @@ EFFECTS: dict[str, dict[str, Any]] = {
     "nonlinearity_quadratic": {},
     "nonlinearity_cubic": {},
     "cross_field": {},
-    "hysteresis": {"half_width_nT": 4000.0},
+    "hysteresis": {"half_width_nT": [4000.0]},
     "offset_step": {"time_s": [800.0]},
     "sampling_lag": {"per_axis": True},
     "eddy_current": {},
