@@ -71,7 +71,7 @@ def main(name: str, given: list[str]) -> None:
     told = f"{sensors[0]}, {', '.join(given)}" if given else sensors[0]
     print(f"{sensors[1]} predicted from {told} and ... : error on blocks not fitted, nT rms (x, y, z, all)")
     for label in [*ranked[:12], *(k for k in ranked[12:] if k in ("nothing more", "time", "time and its square"))]:
-        print(f"  {label:38s}" + "".join(f"{e:9.0f}" for e in (*table[label], np.sqrt(np.mean(table[label] ** 2)))))
+        print(f"  {label:38s}" + "".join(f"{e:9.4g}" for e in (*table[label], np.sqrt(np.mean(table[label] ** 2)))))
 
 
 if __name__ == "__main__":
