@@ -83,7 +83,7 @@ def sentence(outcome: dict[str, Any]) -> str:
     floor = outcome["noise_floor_nT"]
     noise = f"; sensor noise {_figure(floor)} nT" if floor is not None else ""
     told = f"{', '.join(figures)} {where}{noise}" if figures else f"no error figure can be given{noise}"
-    model = " and ".join(outcome["declared"]) or "no model"
+    model = f"the {' and '.join(outcome['declared'])} model" if outcome["declared"] else "no model"
     adopted = [a["error_model"] for a in outcome["adopted"]]
     left = outcome["unexplained"]
     if adopted:

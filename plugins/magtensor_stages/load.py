@@ -28,7 +28,9 @@ BY = "load"
 def load(
     survey: Survey,
     *,
-    sensors: Annotated[tuple[str, ...] | None, Field(description="use only these sensors; default: all")] = None,
+    sensors: Annotated[
+        tuple[str, ...] | None, Field(min_length=1, description="use only these sensors; default: all")
+    ] = None,
     window_s: Annotated[
         tuple[float, float] | None, Field(description="use only this span, s after the first sample")
     ] = None,

@@ -280,12 +280,14 @@ def test_shapes(shape: str, count: int) -> None:
     ("changes", "message"),
     [
         ({"rate_hz": 5.0}, r"rate_hz: unknown key \(did you mean rate_Hz"),
+        ({"effects": [{"nT_per_h": 3.0}]}, r"effects\[0\]: needs 'type'"),
+        ({"effects": [{"type": "ofset_drift"}]}, r"\[0\].type: there is no 'ofset_drift' \(did you mean offset_"),
         (
             {"motion": {"type": "tumbling", "duration": 5.0}},
             r"motion.duration: unknown key \(did you mean duration_s",
         ),
         ({"motion": {"type": "tumbling"}}, "motion: needs 'duration_s'"),
-        ({"motion": {"type": "tumble"}}, "'tumbling'"),
+        ({"motion": {"type": "tumble"}}, "did you mean tumbling"),
         ({"seed": "one"}, "seed: input should be a valid integer"),
         ({"rate_Hz": float("nan")}, "rate_Hz: input should be a finite number"),
         ({"rate_Hz": -1.0}, "rate_Hz: input should be greater than 0"),

@@ -67,6 +67,15 @@ class Problems:
             known = _known_keys(model, error["loc"][:-1])
             near = did_you_mean(str(trail[-1]), known) or (f"; known here: {', '.join(known)}" if known else "")
             self.add(place, f"unknown key{near}")
+        elif kind == "union_tag_not_found":
+            self.add(place, f"needs {error['ctx']['discriminator'].strip(chr(39))!r}, which says what it is")
+        elif kind == "union_tag_invalid":
+            context = error["ctx"]
+            names = [w.strip("' ") for w in context["expected_tags"].split(",")]
+            near = did_you_mean(str(context["tag"]), names) or f"; there are {', '.join(names)}"
+            self.add((*place, context["discriminator"].strip("'")), f"there is no {context['tag']!r}{near}")
+        elif kind == "too_short":
+            self.add(place, f"needs {error['ctx']['min_length']} or more, not {error['ctx']['actual_length']}")
         elif kind == "missing":
             self.add(place, f"needs {str(error['loc'][-1])!r}")
         elif kind == "literal_error":
