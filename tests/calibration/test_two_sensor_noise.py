@@ -1,0 +1,58 @@
+"""Two sensors share one residual; the total field tells whose the noise is."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from magtensor.calibration.joint import calibrated, fit_joint
+from magtensor.calibration.noise import noise_std, shares_of_two
+from magtensor.errors import NotEnoughData
+
+F = 50_000.0
+
+
+def turned(rng: np.random.Generator, n: int) -> np.ndarray:
+    """(n, 3) nT, a smooth path over the sphere."""
+    t = np.linspace(0, 40 * np.pi, n)
+    height = np.cos(t / 20)
+    r = np.sqrt(1 - height**2)
+    return F * np.column_stack([r * np.cos(t), r * np.sin(t), height])
+
+
+def survey(seed: int, noise: tuple[float, float], reference: float) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    b = turned(rng, 8000)
+    raw = np.stack([b + s * rng.standard_normal(b.shape) for s in noise], axis=1)
+    return raw, F + reference * rng.standard_normal(len(b))
+
+
+@pytest.mark.parametrize("reference", [0.0, 20.0])
+def test_shares(reference: float) -> None:
+    raw, total_field = survey(1, (10.0, 30.0), reference)
+    assert shares_of_two(raw, total_field) == pytest.approx([0.1, 0.9], abs=0.03)
+    std = noise_std(raw, total_field)
+    assert std[0] == pytest.approx(10.0, rel=0.2)
+    assert std[1] == pytest.approx(30.0, rel=0.05)
+
+
+def test_the_quieter_sensor_leads_the_joint_fit() -> None:
+    raw, total_field = survey(2, (2.0, 100.0), 0.0)
+    fit = fit_joint(raw, total_field)
+    found = calibrated(fit, total_field, raw)
+    noise = fit.plane.noise.reshape(2, 3)
+    assert (noise[1] / noise[0] > 5).all()
+    # the quieter sensor's own 2 nT over 8000 samples; with equal weights it would be some 50 nT
+    assert np.abs(found.offset[0]).max() < 5 * 2.0 * np.sqrt(3 / 8000) * 3
+
+
+def test_a_strong_effect_is_no_lack_of_attitudes_until_the_model_is_complete() -> None:
+    raw, total_field = survey(3, (5.0, 5.0), 0.0)
+    slow = 3_500.0 * np.sin(np.linspace(0, 7 * np.pi, len(raw)))
+    raw = raw + slow[:, None, None] * np.array([1.0, -0.5, 0.8])
+    fit_joint(raw, total_field, complete=False)
+    with pytest.raises(NotEnoughData):
+        fit_joint(raw, total_field)
+    planar = raw * np.array([1.0, 1.0, 0.0]) + np.array([0.0, 0.0, 1_000.0])
+    with pytest.raises(NotEnoughData):
+        fit_joint(planar, total_field, complete=False)
