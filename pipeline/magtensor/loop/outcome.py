@@ -121,6 +121,8 @@ def why(candidate: Candidate, winner: Candidate | None) -> str:
     figures = f"p {candidate.adjusted_p:.2g} after correction, held-out gain {gain.total:.4g} (t {gain.t:.2g})"
     if candidate.adjusted_p >= candidate.alpha:
         return f"not significant: {figures}"
+    if candidate.of_the_log and candidate.log_noise > 0:
+        return f"noise in the log of its channel, which another model brought in, explains as much: {figures}"
     if not candidate.passes:
         return f"does not predict held-out blocks: {figures}"
     if winner is not None:

@@ -12,6 +12,7 @@ from magtensor.components import Component
 from magtensor.loop.assessment import Assessment, Colours, assess, estimated, explained
 from magtensor.loop.colour import Colour
 from magtensor.loop.excitation import Excitation
+from magtensor.loop.log_noise import brought_in
 from magtensor.loop.model import Adopted, State
 from magtensor.loop.residual import Residual
 from magtensor.loop.settings import EventTimes, Range
@@ -37,6 +38,7 @@ class Candidate:
         assessment: of the terms, given the models adopted before.
         adjusted_p: after the correction for settings and for the number of models.
         alpha: what the adjusted p has to stay below.
+        log_noise: what noise in the log of its channel, brought in by a model adopted before, lets it gain.
     """
 
     model: Adopted
@@ -45,10 +47,18 @@ class Candidate:
     assessment: Assessment
     adjusted_p: float
     alpha: float = ALPHA
+    log_noise: float = 0.0
+
+    @property
+    def of_the_log(self) -> bool:
+        """Whether noise in the log of a channel explains what it gains."""
+        return self.assessment.gain.total <= self.log_noise
 
     @property
     def passes(self) -> bool:
         """Both gates."""
+        if self.of_the_log:
+            return False
         gain, null = self.assessment.gain, self.assessment.null_gain
         reduction = gain.total / max(float(gain.before.sum()), 1e-300)
         return self.adjusted_p < self.alpha and null.total > 0 and gain.consistent and reduction > LEAST_REDUCTION
@@ -83,7 +93,7 @@ def settings_grid(model: Component, x: Excitation) -> list[dict[str, Any]]:
 def candidates_of(state: State, models: Sequence[Component], failed: dict[str, str], alpha: float) -> list[Candidate]:
     """The most promising models with their best settings, assessed; their p values corrected for all that was tried."""
     residual = state.residual
-    step = max(1, len(residual.affine) // SCREENING_SAMPLES)
+    step = -(-len(residual.affine) // SCREENING_SAMPLES)
     thin = np.arange(0, len(residual.affine), step)
     few = Scorer(residual.smaller(thin), None if state.terms is None else state.terms.at(thin), WHITE)
     white = Scorer(residual, state.terms, WHITE)
@@ -123,10 +133,19 @@ def candidates_of(state: State, models: Sequence[Component], failed: dict[str, s
         running = max(running, min(1.0, found[i][3].p * found[i][1] * max(len(scored) - rank, 1)))
         adjusted[i] = running
     candidates = [
-        Candidate(model, tried, terms, assessment, float(p), alpha)
+        Candidate(model, tried, terms, assessment, float(p), alpha, _log_noise(state, model))
         for (model, tried, terms, assessment), p in zip(found, adjusted, strict=True)
     ]
     return sorted(candidates, key=lambda c: -c.assessment.gain.total)
+
+
+def _log_noise(state: State, model: Adopted) -> float:
+    return brought_in(state, model.settings) if generic(model) else 0.0
+
+
+def generic(model: Adopted) -> bool:
+    """A model of anything that follows a channel says less than one that names a cause."""
+    return model.name in ("channel_response", "latent_source")
 
 
 def _already(state: State, model: Component, settings: Mapping[str, Any]) -> bool:

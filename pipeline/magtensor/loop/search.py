@@ -15,12 +15,13 @@ import numpy as np
 
 from magtensor.calibration.types import Array
 from magtensor.components import Component
+from magtensor.errors import DataError
 from magtensor.loop.assessment import Colours
 from magtensor.loop.excitation import Excitation
 from magtensor.loop.model import Adopted, Fitting, Record, State, joint_state
 from magtensor.loop.needs import missing
 from magtensor.loop.residual import Residual
-from magtensor.loop.screening import ALPHA, Candidate, Scorer, candidates_of, golden, profiled, repeatable
+from magtensor.loop.screening import ALPHA, Candidate, Scorer, candidates_of, generic, golden, profiled, repeatable
 from magtensor.loop.settings import Range
 from magtensor.loop.spectrum import spectral_lines
 from magtensor.loop.statistics import Gain, family_p, held_out_gain
@@ -90,6 +91,8 @@ def search(
     alpha: family-wise false-alarm probability of the first gate.
     say: called with a line about each round.
     """
+    if declared:
+        _require_channels(joint_state(record, [], how).excitation, declared)
     state = first = joint_state(record, declared, how)
     testable, not_tested = _testable(first.excitation, models)
     steps: list[Step] = []
@@ -118,6 +121,23 @@ def search(
     return Search(first, state, tuple(steps), not_tested, failed)
 
 
+def _require_channels(x: Excitation, declared: Sequence[Adopted]) -> None:
+    """A declared error model needs its channels.
+
+    Raises
+    ------
+    DataError: the survey lacks some.
+    """
+    words = [
+        f"{model.name} needs {' and '.join(lacks)}" for model in declared if (lacks := missing(model.component, x))
+    ]
+    if words:
+        raise DataError(
+            f"the declared error models cannot be fitted to this survey: {'; '.join(words)}",
+            hint=f"it logs {', '.join(sorted(x.logged)) or 'no channel'}; leave the model out or log what it follows",
+        )
+
+
 def _testable(x: Excitation, models: Sequence[Component]) -> tuple[list[Component], dict[str, tuple[str, ...]]]:
     """The models whose channels exist, and what the others miss."""
     lacking = {model.name: tuple(missing(model, x)) for model in models}
@@ -136,13 +156,8 @@ def _simplest(best: Candidate, candidates: Sequence[Candidate], state: State) ->
         gain = _fold_gain(other, residual, state, colours)
         if reference.total - gain.total < SEPARATION:
             equal.append(other)
-    chosen = min(equal, key=lambda c: (_generic(c.model), c.assessment.estimate.rank, -c.assessment.gain.total))
+    chosen = min(equal, key=lambda c: (generic(c.model), c.assessment.estimate.rank, -c.assessment.gain.total))
     return chosen, tuple(sorted({c.model.name for c in equal if c is not chosen} - {chosen.model.name}))
-
-
-def _generic(model: Adopted) -> bool:
-    """A model of anything that follows a channel says less than one that names a cause."""
-    return model.name in ("channel_response", "latent_source")
 
 
 def _fold_gain(candidate: Candidate, residual: Residual, state: State, colours: Colours) -> Gain:

@@ -55,7 +55,7 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
     line = strongest_line(state, record)
     turning = predictable_from_direction(state)
     last = found.steps[-1].candidates if found.steps else ()
-    suspects = [c for c in last if c.adjusted_p < c.alpha and c.assessment.gain.total > 0]
+    suspects = [c for c in last if c.adjusted_p < c.alpha and not c.of_the_log]
     words: list[str] = []
     if waveform is not None and waveform.p <= ALPHA:
         words.append(_waveform_words(waveform, record))
