@@ -5,11 +5,12 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
+from pydantic import Field
+
 from magtensor import metric
 from magtensor.accuracy import COMPONENTS, error_block, rms
 from magtensor.calibration.noise import noise_std
 from magtensor.qc import Verdict
-from pydantic import Field
 
 if TYPE_CHECKING:
     from magtensor.survey.model import Survey
