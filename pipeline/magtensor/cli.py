@@ -214,6 +214,7 @@ def status_of(arguments: list[str] | None = None) -> int:
         error.show()
         return 2
     except click.Abort:
+        click.echo("stopped", err=True)
         return 130
     except MagtensorError as error:
         _progress_end()

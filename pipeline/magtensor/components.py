@@ -182,7 +182,15 @@ def _mark(kind: str, name: str | None, **facts: Any) -> Callable[[F], F]:
     return decorate
 
 
+def _with_parentheses(kind: str, given: object) -> None:
+    """`@stage` alone would make the function the decorator's argument."""
+    if callable(given):
+        raise PluginError(f"write @{kind}(...) with parentheses above {getattr(given, '__name__', 'the function')}")
+
+
 def stage(
+    function: None = None,
+    /,
     *,
     name: str | None = None,
     needs: Iterable[str] = (),
@@ -196,6 +204,7 @@ def stage(
     The survey is read-only; what the function returns is merged into it by the runner, which checks both
     against the declaration. `declares` replaces the four lists where they depend on the options.
     """
+    _with_parentheses("stage", function)
     return _mark(
         "stage",
         name,
@@ -205,16 +214,21 @@ def stage(
 
 def method(step: str, *, name: str | None = None, source: str = "") -> Callable[[F], F]:
     """Mark a function as one of the methods of stage `step`; the stage documents the signature it calls."""
+    _with_parentheses("method", step)
     return _mark("method", name, step=step, source=source)
 
 
-def reader(*, name: str | None = None, suffixes: Iterable[str] = ()) -> Callable[[F], F]:
+def reader(function: None = None, /, *, name: str | None = None, suffixes: Iterable[str] = ()) -> Callable[[F], F]:
     """Mark ``function(paths, *, options) -> RawTables`` as a file reader for these file-name endings."""
+    _with_parentheses("reader", function)
     return _mark("reader", name, suffixes=tuple(suffixes))
 
 
-def metric(*, name: str | None = None, needs: Iterable[str] = (), uses: Iterable[str] = ()) -> Callable[[F], F]:
+def metric(
+    function: None = None, /, *, name: str | None = None, needs: Iterable[str] = (), uses: Iterable[str] = ()
+) -> Callable[[F], F]:
     """Mark ``function(survey, *, options) -> list[Verdict]`` as a QC metric."""
+    _with_parentheses("metric", function)
     return _mark("metric", name, declares=Declares(tuple(needs), tuple(uses)))
 
 
@@ -237,6 +251,7 @@ def error_model(
         source: where the model comes from.
         typical: its usual magnitude, in words.
     """
+    _with_parentheses("error_model", effect)
     return _mark("error_model", name, declares=Declares(tuple(needs)), effect=effect, source=source, typical=typical)
 
 

@@ -100,7 +100,7 @@ def show_one(registry: Registry, name: str) -> None:
     found = [(key, c) for key, c in sorted(registry.components.items()) if c.name == name]
     if not found:
         names = {n for _, _, n in registry.components}
-        raise UsageError(f"no component is called {name!r}{did_you_mean(name, names)}")
+        raise UsageError(f"no component is called {name!r}{did_you_mean(name, names)}{registry.broken_in_words()}")
     console = Console()
     for (kind, step, _), component in found:
         console.print(f"[bold]{kind} {name}[/bold]" + (f" of {step}" if step else ""))

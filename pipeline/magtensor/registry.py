@@ -156,10 +156,11 @@ class Registry:
         known = self.names(kind, step)
         of = f" of {step}" if step else ""
         near = did_you_mean(name, known) or f"; there are {', '.join(known) or 'none'}"
-        message = f"no {kind}{of} is called {name!r}{near}"
-        for plugin in self.broken():
-            message += f"\n  the plugin {plugin.origin} could not be loaded: {plugin.error}"
-        return message
+        return f"no {kind}{of} is called {name!r}{near}{self.broken_in_words()}"
+
+    def broken_in_words(self) -> str:
+        """For a message about something that is missing: a line for each plugin that could not be loaded."""
+        return "".join(f"\n  the plugin {p.origin} could not be loaded: {p.error}" for p in self.broken())
 
     def broken(self) -> Iterator[Plugin]:
         """The plugins that could not be loaded."""

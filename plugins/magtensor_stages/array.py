@@ -116,8 +116,9 @@ def assemble_tensor(
     try:
         with naming(survey):
             assembly = method(position, np.diag(noise.ravel() ** 2) if known else None)
-    except NotEnoughData:
+    except NotEnoughData as error:
         if required:
-            raise
+            leave_out = "`assemble_tensor: {required: false}` goes on without a tensor"
+            raise NotEnoughData(error.what, where=error.where, hint=f"{error.hint}; {leave_out}") from error
         return noise_variables(noise)
     return assembly_variables(assembly, position, noise) | assembled(assembly, b, position, noise, restored(survey))

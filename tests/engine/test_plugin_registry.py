@@ -41,6 +41,8 @@ def broken(registry: Registry) -> dict[str, str]:
          "option x"),
         ("from magtensor import stage\n@stage()\ndef f(survey, *, x: int = 'one'):\n    '''F.'''",
          "default of option x"),
+        *((f"from magtensor import {kind}\n@{kind}\ndef f(x):\n    'F.'", f"@{kind}(...) with parentheses above f")
+          for kind in ("stage", "method", "reader", "metric", "error_model")),
         ("from magtensor.hookspecs import hookimpl\n@hookimpl\ndef magtensor_components():\n    return 5", "TypeError"),
         ("from magtensor.hookspecs import hookimpl\n@hookimpl\ndef magtensor_components():\n    raise OSError('x')",
          "OSError: x"),

@@ -37,4 +37,5 @@ def simulate_file(scenario: Path, output: Path, overrides: Sequence[str] = ()) -
     assert checked is not None
     simulated = simulate(checked)
     write(simulated, output)
-    return f"simulated: {output}: {len(simulated.time)} samples of {len(simulated.sensors)} sensors"
+    sensors = f"{len(simulated.sensors)} sensor{'s' * (len(simulated.sensors) > 1)}"
+    return f"simulated: {output}: {len(simulated.time)} samples of {sensors}"
