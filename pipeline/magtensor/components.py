@@ -185,7 +185,7 @@ def _mark(kind: str, name: str | None, **facts: Any) -> Callable[[F], F]:
 def _with_parentheses(kind: str, given: object) -> None:
     """`@stage` alone would make the function the decorator's argument."""
     if callable(given):
-        raise PluginError(f"write @{kind}(...) with parentheses above {getattr(given, '__name__', 'the function')}")
+        raise TypeError(f"write @{kind}(...) with parentheses above {getattr(given, '__name__', 'the function')}")
 
 
 def stage(
