@@ -12,6 +12,11 @@ COMPONENTS = ("xx", "xy", "xz", "yy", "yz", "zz")
 _INDEX = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 
+def figure(value: float) -> str:
+    """Three digits as a person writes them: 2090, not 2.09e+03."""
+    return f"{value:.0f}" if 1e3 <= abs(value) < 1e6 else f"{value:.3g}"
+
+
 def error_block(
     b: Array, total_field: Array | None, tensor: Array | None, good: np.ndarray, sensors: list[str]
 ) -> dict[str, Any]:

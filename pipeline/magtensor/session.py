@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from magtensor import provenance, result
+from magtensor.accuracy import figure
 from magtensor.atomic import refuse_overwriting, require_writable
 from magtensor.calibrated import left_open
-from magtensor.errors import DataError
+from magtensor.errors import DataError, UsageError
 from magtensor.provenance import Provenance
 from magtensor.qc import told
 from magtensor.recipe.plan import Plan, plan, read_plan
@@ -94,7 +95,10 @@ def run_plan(
     """Run a plan and write the files of the contract; as `run_recipe`."""
     require_writable(output)
     source = planned.source()
-    refuse_overwriting([output / name for name in result.FILES], [*source.files(), *([verify] if verify else [])])
+    files = source.files()
+    refuse_overwriting([output / name for name in result.FILES], [*files, *([verify] if verify else [])])
+    if verify is not None and verify.resolve() in {f.resolve() for f in files}:
+        raise UsageError(f"{verify}: this is the survey itself; a verification survey is one that the fit has not seen")
     if progress is not None:
         progress("start")
     done = run(planned, empty_survey(planned), progress=progress)
@@ -258,5 +262,6 @@ def fit_in_words(applied: Survey) -> str:
     figures = (block or {}).get("total_field_rms_nT")
     if not figures or figures["all"] is None:
         return "How well it fits cannot be told: this survey has no total field at its samples."
-    each = ", ".join(f"{name} {value:.3g}" for name, value in figures.items() if name != "all" and value is not None)
-    return f"|b| - F: {figures['all']:.3g} nT rms on this survey ({each})."
+    known = {name: value for name, value in figures.items() if name != "all" and value is not None}
+    each = ", ".join(f"{name} {figure(value)}" for name, value in known.items())
+    return f"|b| - F: {figure(figures['all'])} nT rms on this survey ({each})."

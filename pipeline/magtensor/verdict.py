@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from typing import Any
 
-from magtensor.accuracy import error_block
+from magtensor.accuracy import error_block, figure
 from magtensor.survey.model import Survey
 
 SCHEMA = 1
@@ -117,4 +117,4 @@ def _change(before: dict[str, Any] | None, after: dict[str, Any], key: str) -> s
 
 
 def _figure(value: float | None) -> str:
-    return "unknown" if value is None else f"{value:.3g}"
+    return "unknown" if value is None else figure(value)

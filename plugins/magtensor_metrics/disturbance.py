@@ -8,6 +8,7 @@ import numpy as np
 from pydantic import Field
 
 from magtensor import metric
+from magtensor.accuracy import figure
 from magtensor.calibration.noise import MAD_TO_SIGMA, noise_std
 from magtensor.qc import Verdict
 
@@ -34,7 +35,8 @@ def noise_level(survey: Survey, *, warn_share: FieldShare = 1e-3, fail_share: Fi
         found = float(noise_std(survey.values("calibrated/b")[good, i : i + 1], reference[good])[0, 0])
         share = found / float(np.mean(reference[good]))
         state = "pass" if share <= warn_share else "warn" if share <= fail_share else "fail"
-        words = f"{found:.3g} nT, {share:.2%} of the field" + (
+        of_field = f"{1e6 * share:.2g} ppm" if share < 1e-4 else f"{share:.2%}"
+        words = f"{figure(found)} nT, {of_field} of the field" + (
             "" if state == "pass" else ": a coarse or disturbed sensor; its calibration is no better"
         )
         limit = warn_share * float(np.mean(reference[good]))

@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import Field
 
 from magtensor import metric
-from magtensor.accuracy import COMPONENTS, error_block, rms
+from magtensor.accuracy import COMPONENTS, error_block, figure, rms
 from magtensor.calibration.noise import noise_std
 from magtensor.qc import Verdict
 
@@ -98,7 +98,7 @@ def _against_noise(
     if value is None or not np.isfinite(noise):
         return Verdict(name, float("nan"), units, "warn", "no samples, or too few to find their noise")
     ratio = value / noise if noise > 0 else np.inf
-    shown = f"{value:.3g} {units} rms, {ratio:.3g} times what noise alone gives ({noise:.3g})"
+    shown = f"{figure(value)} {units} rms, {figure(ratio)} times what noise alone gives ({figure(noise)})"
     if ratio <= warn_ratio:
         return Verdict(name, value, units, "pass", shown, warn_ratio * noise)
     advice = "an effect that the model lacks, or a field that is not uniform"

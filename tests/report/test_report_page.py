@@ -184,7 +184,7 @@ def without(survey: Survey, *paths: str) -> Survey:
     ("missing", "gone", "said"),
     [
         (("residual", "qc"), "What is left of the total field", "holds no |b| − F"),
-        (("residual/total_field", "array/diurnal"), "What is left against direction", "nothing was taken off"),
+        (("residual/total_field", "array/diurnal"), "What is left against direction", "of each sensor is held."),
         (("residual/contrast", "residual/total_field_before"), "Contrasts between the sensors", "noise alone"),
         (("residual/closure", "calibrated/tensor_std", "calibration"), "Trace and asymmetry", "holds no calibration"),
         (("calibrated/tensor", "calibrated/tensor_std"), "Gradient tensor", "three or more sensors"),

@@ -233,8 +233,8 @@ def _reference(content: Content) -> Picture | Gap:
     title = "Reference"
     if total_field is None and diurnal is None:
         return Gap(title, "The result holds no total field at the samples of the array: no stage made one.")
-    taken = ", and the diurnal variation that was taken off." if diurnal is not None else "; nothing was taken off."
-    caption = f"The total field at the samples of the array{taken}"
+    varies = "" if diurnal is None else ", and how far it lies from its base value. A scalar is not taken off a vector"
+    caption = f"The total field at the samples of the array, against which |b| of each sensor is held{varies}."
     return picture(
         title, caption, lambda: time_pictures.reference(content.time, content.time_units, total_field, diurnal)
     )

@@ -357,6 +357,7 @@ def diagnostics(content: Content) -> list[tuple[str, str]]:
     shown = [
         (named(str(k))[0], f"{number(v, 5)} {named(str(k))[1]}".rstrip() if isinstance(v, (int, float)) else str(v))
         for k, v in (found.items() if isinstance(found, dict) else ())
+        if v != ""
     ]
     facts = content.attributes("calibration/matrix")
     if "method" in facts:

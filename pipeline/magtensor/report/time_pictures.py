@@ -142,7 +142,7 @@ def invariants(time: Array, units: str, values: Array, std: Array | None, names:
 
 
 def reference(time: Array, units: str, total_field: Array | None, diurnal: Array | None) -> Figure:
-    """The total field the sensors were held against, and the diurnal variation taken off. (N,) nT each."""
+    """The total field the sensors were held against, and its diurnal variation. (N,) nT each."""
     shown = [(v, w) for v, w in ((total_field, "total field F"), (diurnal, "diurnal variation")) if v is not None]
     figure, grid = panels(len(shown), 1, 1.05, left=1.0, sharex=True)  # five digits and more stand at the left
     axis = clock(time, units)
