@@ -122,11 +122,12 @@ def validate(recipe: Path, survey: Path | None, overrides: tuple[str, ...], plug
 @cli.command()
 @click.argument("file", type=FILE)
 @click.option("--reader", help="The reader plugin; default: by the file name's ending.")
-def inspect(file: Path, reader: str | None) -> None:
+@plugins_option
+def inspect(file: Path, reader: str | None, plugin_folders: tuple[Path, ...]) -> None:
     """Show what FILE holds, and propose a mapping for a recipe."""
     from magtensor.survey.inspect import show
 
-    show(file, reader)
+    show(file, reader, plugin_folders)
 
 
 @cli.command()

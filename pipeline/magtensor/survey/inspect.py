@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -194,7 +194,7 @@ def as_plain(facts: FileFacts) -> dict[str, Any]:
     return asdict(facts)
 
 
-def show(file: Path, reader: str | None = None) -> None:
+def show(file: Path, reader: str | None = None, plugin_folders: Sequence[Path] = ()) -> None:
     """Print what a file holds and the mapping to paste into a recipe.
 
     Raises:
@@ -207,7 +207,7 @@ def show(file: Path, reader: str | None = None) -> None:
     from magtensor.recipe.plan import readers as readers_of
     from magtensor.registry import Registry
 
-    facts = describe(file, readers_of(Registry.load()), reader)
+    facts = describe(file, readers_of(Registry.load(plugin_folders)), reader)
     console = Console() if sys.stdout.isatty() else Console(width=200)  # a file or a pipe has no edge to wrap at
     console.print(f"[bold]{', '.join(facts.files)}[/bold]  (reader {facts.reader})", highlight=False)
     table = Table(box=None, pad_edge=False)
