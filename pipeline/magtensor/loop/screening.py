@@ -20,6 +20,7 @@ from magtensor.loop.terms import Terms, joined
 
 ALPHA = 0.005  # family-wise probability that a clean survey gets an adoption, before the second gate
 LEAST_REDUCTION = 1e-4  # of the held-out sum of squares: smaller is significant only in very long surveys
+LOG_MARGIN = 1.5  # the noise of a log is known to some per cent, and a dozen coefficients gain a little by chance
 SCREENED = 8  # models looked at closely in each round
 SCREENING_SAMPLES = 4000  # settings are profiled on so many samples
 _REFINEMENTS = 8
@@ -52,7 +53,7 @@ class Candidate:
     @property
     def of_the_log(self) -> bool:
         """Whether noise in the log of a channel explains what it gains."""
-        return self.assessment.gain.total <= self.log_noise
+        return self.assessment.gain.total <= LOG_MARGIN * self.log_noise
 
     @property
     def passes(self) -> bool:

@@ -16,7 +16,7 @@ import numpy as np
 from magtensor.calibration.types import Array
 from magtensor.components import Component
 from magtensor.errors import DataError
-from magtensor.loop.assessment import Colours
+from magtensor.loop.assessment import Colours, estimated, explained
 from magtensor.loop.excitation import Excitation
 from magtensor.loop.model import Adopted, Fitting, Record, State, joint_state
 from magtensor.loop.needs import missing
@@ -178,12 +178,33 @@ def _adopt(record: Record, state: State, chosen: Candidate, how: Fitting) -> Sta
     start: list[Array] = [*state.theta, np.zeros(chosen.terms.count)]
     after = joint_state(record, [*state.adopted, chosen.model], how, start)
     sensors = _sensors_showing(after, len(state.adopted))
-    if sensors is None:
+    if sensors is None or not _spare(after, len(state.adopted), sensors):
         return after
     narrowed = Adopted(chosen.model.component, chosen.model.settings, sensors)
     every = chosen.terms
     keep = [i for i, s in enumerate(every.sensors) if s in sensors or s == ""]
     return joint_state(record, [*state.adopted, narrowed], how, [*state.theta, after.theta[-1][keep]])
+
+
+def _spare(state: State, which: int, sensors: tuple[str, ...]) -> bool:
+    """Whether a model can do without its coefficients for all but some sensors.
+
+    A coefficient may be insignificant because others can stand in for it, as where only differences between sensors
+    are seen (a delay of all of them is a turn of the field): each could go, and not several of them.
+    """
+    from scipy.stats import chi2
+
+    assert state.terms is not None
+    part = _slices(state)[which]
+    kept = [
+        i for i, s in enumerate(state.terms.sensors) if not part.start <= i < part.stop or s in sensors or s == ""
+    ]
+    back = put_back(state.residual, state.terms, np.concatenate(state.theta))
+    every = estimated(back, state.terms, state.colours)
+    fewer = estimated(back, state.terms.only(kept), state.colours)
+    gone = state.terms.count - len(kept)
+    lost = explained(every) - explained(fewer)
+    return every.rank - fewer.rank == gone and lost < float(chi2.isf(KEEP_ALPHA, gone))
 
 
 def _polished(record: Record, state: State, how: Fitting) -> State:

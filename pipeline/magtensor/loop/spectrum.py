@@ -25,7 +25,8 @@ def spectral_lines(residual: Residual, time: Array, most: int = 5) -> list[tuple
     values, vectors = np.linalg.eigh(residual.projector)
     coordinates = residual.across @ vectors[:, values > 0.5]
     n, k = coordinates.shape
-    power = np.sum(np.abs(rfft(coordinates, axis=0)) ** 2, axis=1)[1:] / n
+    # without the highest frequency of an even number of samples, which has one phase and not two
+    power = np.sum(np.abs(rfft(coordinates, axis=0)) ** 2, axis=1)[1 : (n + 1) // 2] / n
     frequency = np.arange(1, len(power) + 1) / (n * step)
     width = max(len(power) // 100, 15)
     smooth = _running_median(power, width)
@@ -47,5 +48,5 @@ def spectral_lines(residual: Residual, time: Array, most: int = 5) -> list[tuple
 def _running_median(values: Array, width: int) -> Array:
     from scipy.ndimage import median_filter
 
-    out: Array = median_filter(values, size=2 * width + 1, mode="nearest")
+    out: Array = median_filter(values, size=2 * width + 1, mode="reflect")
     return out
