@@ -28,7 +28,7 @@ def sampling_lag(
     Minus the rate of change of the output; the coefficient is the delay. A delay common to all sensors is a rotation
     of the field and shows only against a reference. Rivals: `eddy_current`, which contains it; `bandwidth`.
     """
-    late = -x.derivative(x.output)
+    late = -x.sensed(x.rate)
     return x.responses(late, "s", "lag ") if per_axis else x.one_each(late, "s", "lag")
 
 
@@ -45,7 +45,7 @@ def eddy_current(x: Excitation) -> Terms:
     field and shows only against a reference. Rivals: `sampling_lag` and `bandwidth`, both contained in it;
     `viscous_magnetisation` with a short time constant.
     """
-    return x.matrices(-x.derivative(x.field_or_fields), "s")
+    return x.matrices(-x.rate, "s")
 
 
 @error_model(
@@ -66,7 +66,7 @@ def bandwidth(
     is the time constant found. To first order that is a delay, so `sampling_lag` is its rival wherever tau_s is short
     against the motion.
     """
-    return x.responses(-x.relaxed(x.derivative(x.output), tau_s), "s")
+    return x.responses(-x.relaxed(x.sensed(x.rate), tau_s), "s")
 
 
 @error_model(
@@ -81,7 +81,7 @@ def clock_drift(x: Excitation) -> Terms:
     Time since the start times the rate of change of the output; one coefficient a sensor. A drift common to all
     sensors shows only against a reference.
     """
-    return x.one_each(1e-6 * x.elapsed[:, None, None] * x.derivative(x.output), "ppm", "drift")
+    return x.one_each(1e-6 * x.elapsed[:, None, None] * x.sensed(x.rate), "ppm", "drift")
 
 
 @error_model(

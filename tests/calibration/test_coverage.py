@@ -1,5 +1,7 @@
 """A degenerate fit is refused with the attitudes that are missing, never reported as a success."""
 
+import re
+
 import numpy as np
 import pytest
 from paper_setups import CHI_FIELD, chi_response, directions, tilted, triangle
@@ -49,6 +51,18 @@ def test_noise_never_passes_for_coverage() -> None:
         with pytest.raises(NotEnoughData):
             chi2017(raw, field)
             pytest.fail(f"trial {trial} with {count} samples was accepted")
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_sensor_at_rest_hears_that_it_never_turned(method) -> None:
+    """The surface through a day at an observatory lies within the cluster of samples, and sees them all round."""
+    rng = np.random.default_rng(3)
+    raw, _ = measure(np.tile([0.4, 0.0, 0.9165], (20_000, 1)), 20.0, rng)
+    with pytest.raises(NotEnoughData) as refused:
+        method(raw, np.linalg.norm(raw, axis=1) + rng.normal(size=len(raw)))
+    half_angle = re.search(r"cone without a sample: (\d+) deg", str(refused.value))
+    assert half_angle and int(half_angle[1]) > 170
+    assert "+x, +y, -x, -y, -z" in str(refused.value)
 
 
 @pytest.mark.parametrize("method", METHODS)

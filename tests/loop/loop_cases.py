@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +13,11 @@ from numpy.typing import NDArray
 
 from magtensor.loop.model import Fitting, Record, State, joint_state
 from magtensor.loop.record import record_of
-from magtensor.session import run_recipe
+from magtensor.recipe.plan import read_plan
+from magtensor.runner import run
+from magtensor.session import empty_survey, load_as
 from magtensor.simulate import simulate, write
+from magtensor.verdict import verdict
 
 Array = NDArray[np.float64]
 
@@ -22,7 +26,7 @@ RECIPE = Path(__file__).parents[2] / "recipes" / "closed_loop.yaml"
 BASE: dict[str, Any] = {
     "title": "test of the loop",
     "seed": 1,
-    "rate_Hz": 4.0,
+    "rate_Hz": 2.0,
     "instrument": {
         "seed": 7,
         "array": {"shape": "cross", "baseline_m": 0.5},
@@ -66,11 +70,15 @@ def survey_file(folder: Path, description: dict[str, Any], name: str = "survey.h
     return path
 
 
-def verdict_of(folder: Path, description: dict[str, Any], **options: Any) -> dict[str, Any]:
-    """What `magtensor run recipes/closed_loop.yaml` writes of a survey."""
+def verdict_of(
+    folder: Path, description: dict[str, Any], change: Callable[[Path], None] | None = None
+) -> dict[str, Any]:
+    """What `magtensor run recipes/closed_loop.yaml` would say of a survey; `change` may spoil its file before."""
     path = survey_file(folder, description)
-    run_recipe(RECIPE, folder / "result", survey=path, **options)
-    found: dict[str, Any] = json.loads((folder / "result" / "verdict.json").read_text())
+    if change is not None:
+        change(path)
+    planned = read_plan(RECIPE, survey=path)
+    found: dict[str, Any] = json.loads(json.dumps(verdict(run(planned, empty_survey(planned)).survey)))
     return found
 
 
@@ -86,9 +94,6 @@ def suspects(verdict: dict[str, Any]) -> set[str]:
 
 def loaded(folder: Path, description: dict[str, Any]) -> Record:
     """The record of a survey as the loop sees it."""
-    from magtensor.recipe.plan import read_plan
-    from magtensor.session import load_as
-
     path = survey_file(folder, description)
     return record_of(load_as(read_plan(RECIPE, survey=path), path))
 

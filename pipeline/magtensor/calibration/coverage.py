@@ -48,6 +48,7 @@ WORST_ERROR = 0.05  # of F
 UNSEEN = 45.0  # deg: a half axis with no sample nearer counts as never seen
 SCATTERED = 0.5  # of the accepted error: samples so far from the surface are disturbed, whatever their attitudes
 SAME_ATTITUDE = 1e-3  # of F
+FAR_FROM_NOMINAL = 3.0  # scale factors this far from nominal come from a fit that found a surface, not a sensor
 
 
 @dataclass(frozen=True)
@@ -165,13 +166,16 @@ def coverage(
     first, second = (float(d) for d in nearest.distance[:2])
     found = first * np.sqrt(len(raw) / max(len(raw) - 9, 1))
     level = max(found if noise is None else min(found, noise / field), RESOLUTION)
-    directions = _directions(points, centre / field)
+    reach = float(np.median(np.linalg.norm(raw - centre, axis=1))) / field
+    believable = 1 / FAR_FROM_NOMINAL < reach < FAR_FROM_NOMINAL
+    # from the centre of a surface that lies within a cluster of samples, they seem to lie all round
+    directions = _directions(points, centre / field) if believable else _directions(raw, np.zeros(3))
     worst = float("nan")
     condition = _condition(_attitude_design(directions))
     if matrix is not None:
         b = (raw - centre) @ matrix.T
         attitude = _attitude_design(b / np.linalg.norm(b, axis=1, keepdims=True))
-        condition = _condition(attitude)
+        condition = _condition(attitude) if believable else condition
         scatter = _scatter(attitude, matrix, centre, raw, total_field)
         worst = float(np.hypot(scatter, _bias(matrix, centre / field, nearest.coefficients) * field))
     thinned = directions[_distinct(directions, 0.02)]

@@ -156,6 +156,21 @@ class Excitation:
                 out[a:b] = np.gradient(series[a:b], self.time[a:b], axis=0)
         return out
 
+    @cached_property
+    def rate(self) -> Array:
+        """dB/dt (N, 3) nT/s where all sensors see one field, else (N, S, 3).
+
+        Differences between samples cut the corners of a turning field and shorten it; the part along the field is
+        that of its length, which changes slowly. Otherwise a total field would seem to show a delay of all sensors.
+        """
+        b = self.field_or_fields
+        length = np.linalg.norm(b, axis=-1, keepdims=True)
+        along = b / length
+        change = self.derivative(b)
+        own = np.sum(along * change, axis=-1, keepdims=True)
+        out: Array = change + along * (self.derivative(length) - own)
+        return out
+
     def runs(self) -> list[tuple[int, int]]:
         """(first, one past last) sample of each contiguous run."""
         edges = np.flatnonzero(np.diff(self.run)) + 1

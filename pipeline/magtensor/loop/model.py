@@ -206,9 +206,12 @@ def joint_state(
         terms = joined(each).at(residual.samples)
         estimate = estimated(residual, terms, colours_of(residual))
         edges = np.cumsum([e.count for e in each])[:-1]
-        theta = [t + s for t, s in zip(theta, np.split(estimate.theta, edges), strict=True)]
+        before = np.concatenate(theta)
+        # what no data show stays zero, whatever earlier rounds made of it
+        after = estimate.seen(before) + estimate.theta
+        theta = np.split(after, edges)
         raw, reference = without(record, each, theta)
-        step = np.abs(estimate.theta) / np.sqrt(np.maximum(np.diag(estimate.covariance), 1e-300))
+        step = np.abs(after - before) / np.sqrt(np.maximum(np.diag(estimate.covariance), 1e-300))
         if np.max(step, initial=0.0) < _SETTLED:
             fit = _fit(raw, reference, how, keep)
             x = excitation_of(record, fit, lines)

@@ -37,6 +37,11 @@ class Estimate:
     normal: Array
     rank: int
 
+    def seen(self, theta: Array) -> Array:
+        """Coefficients (P,) without their part in directions that are not identifiable."""
+        out: Array = self.covariance @ (self.normal @ theta)
+        return out
+
 
 def solve(n: Array, y: Array, scale: Array) -> Estimate:
     """Least squares in the identifiable directions of one normal matrix.
