@@ -34,4 +34,4 @@ def joint(
     from magtensor.calibration.joint import calibrated, fit_joint
 
     fit = fit_joint(raw, total_field, reference_noise=reference_noise_nT, robust=robust, worst_error=worst_error)
-    return calibrated(fit, total_field, raw, reference_noise_nT)
+    return calibrated(fit)

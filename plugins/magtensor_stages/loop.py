@@ -43,7 +43,7 @@ def close_loop(
     """
     from magtensor.calibration.joint import calibrated
     from magtensor.loop.errors_before_after import held_out_error
-    from magtensor.loop.model import Adopted, Fitting, require_determined, without
+    from magtensor.loop.model import Adopted, Fitting, require_determined
     from magtensor.loop.outcome import described
     from magtensor.loop.record import record_of
     from magtensor.loop.search import search as find
@@ -60,9 +60,7 @@ def close_loop(
     found = find(record, models, how, declared=begin, most_effects=most_effects, alpha=false_alarm)
     first, last = found.first, found.last
     require_determined(record, last, how)
-    raw, field = without(record, [a.terms(last.excitation) for a in last.adopted], last.theta)
-    assert field is not None and record.total_field is not None  # the stage needs a total field
-    calibration = calibrated(last.fit, field, raw, reference_noise_nT)
+    calibration = calibrated(last.fit)
     outcome = {
         "declared": ["linear", *(a.name for a in begin)],
         "noise_floor_nT": float(last.residual.scale),
@@ -77,7 +75,7 @@ def close_loop(
     given = common_frame(clean, calibration, "joint") | effect_variables(last.adopted, last.theta, record.means)
     before_fit = np.linalg.norm(survey.values("b_raw"), axis=2) - survey.values("total_field")[:, None]
     given["residual/total_field_before"] = (("time", "sensor"), before_fit, {"units": "nT", "long_name": "|b_raw| - F"})
-    alone = calibrated(first.fit, record.total_field, record.raw, reference_noise_nT)
+    alone = calibrated(first.fit)
     given["declared/matrix"] = (("sensor", "axis", "raw_axis"), alone.matrix, {})
     given["declared/offset"] = (("sensor", "raw_axis"), alone.offset, {"units": "nT"})
     given["loop/verdict"] = ((), json.dumps(outcome, default=float), {})

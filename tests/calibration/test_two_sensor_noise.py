@@ -39,7 +39,7 @@ def test_shares(reference: float) -> None:
 def test_the_quieter_sensor_leads_the_joint_fit() -> None:
     raw, total_field = survey(2, (2.0, 100.0), 0.0)
     fit = fit_joint(raw, total_field)
-    found = calibrated(fit, total_field, raw)
+    found = calibrated(fit)
     noise = fit.plane.noise.reshape(2, 3)
     assert (noise[1] / noise[0] > 5).all()
     # the quieter sensor's own 2 nT over 8000 samples; with equal weights it would be some 50 nT

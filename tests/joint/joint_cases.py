@@ -88,7 +88,7 @@ def drawn(
 def fitted(survey: Drawn, **options: object) -> ArrayCalibration:
     """The joint calibration with the smallest demands on coverage: some surveys here are poor on purpose."""
     fit = fit_joint(survey.raw, survey.total_field, worst_error=1.0, **options)  # type: ignore[arg-type]
-    return calibrated(fit, survey.total_field, survey.raw)
+    return calibrated(fit)
 
 
 def truth(survey: Drawn) -> tuple[Array, Array]:

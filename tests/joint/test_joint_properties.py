@@ -11,30 +11,70 @@ from joint_cases import Array, drawn, fitted, tensor_error, truth
 
 from magtensor.calibration.common_field import common_field
 from magtensor.calibration.joint import fit_joint
-from magtensor.calibration.maximum_likelihood import fit_scalar, whitened_residual
+from magtensor.calibration.maximum_likelihood import along, fit_scalar, scores
 from magtensor.errors import DataError, NotEnoughData
 
-UPPER = np.array([(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)])
+PAIRS = ((1, 2), (0, 2), (0, 1))
+
+
+def changed(matrix: Array, offset: Array, step: Array) -> tuple[Array, Array]:
+    """Matrix and offset whose field is b + E b + e, written anew."""
+    e = np.diag(step[:3])
+    for value, (i, j) in zip(step[3:6], PAIRS, strict=True):
+        e[i, j] = e[j, i] = value
+    matrix = (np.eye(3) + e) @ matrix
+    return matrix, offset - np.linalg.inv(matrix) @ step[6:]
+
+
+def cost(matrix: Array, offset: Array, y: Array, field: Array, reference_noise: float) -> float:
+    """Sum of the squared distances from the surface, sample by sample."""
+    total = 0.0
+    for sample, f in zip(y, field, strict=True):
+        b = matrix @ (sample - offset)
+        u = b / np.linalg.norm(b)
+        total += (np.linalg.norm(b) - f) ** 2 / (np.sum((matrix.T @ u) ** 2) + reference_noise**2)
+    return total
 
 
 @pytest.mark.parametrize("reference_noise", [0.0, 0.7])
-def test_derivative_of_the_whitened_residual(reference_noise: float) -> None:
+def test_gradient_of_the_scalar_cost(reference_noise: float) -> None:
     rng = np.random.default_rng(2)
     # noise of a tenth of the field, so that the derivative of the denominator counts
     y = 10.0 * rng.standard_normal((50, 3)) / np.sqrt(3) + rng.standard_normal((50, 3))
-    p = np.array([1.1, 0.2, -0.1, 0.9, 0.3, 1.3, 0.4, -0.5, 0.6])
+    matrix = np.array([[1.1, 0.2, -0.1], [0.0, 0.9, 0.3], [0.1, 0.0, 1.3]])
+    offset, field = np.array([0.4, -0.5, 0.6]), np.full(50, 10.0)
+    found = scores(along(matrix, offset, y.T, field, reference_noise), field)
+    assert found.cost == pytest.approx(cost(matrix, offset, y, field, reference_noise), rel=1e-12)
 
-    def residual(q: Array) -> Array:
-        matrix = np.zeros((3, 3))
-        matrix[UPPER[:, 0], UPPER[:, 1]] = q[:6]
-        return whitened_residual(matrix, q[6:], y, np.full(50, 10.0), reference_noise)[0]
+    def at(step: Array) -> float:
+        return cost(*changed(matrix, offset, step), y, field, reference_noise)
 
-    matrix = np.zeros((3, 3))
-    matrix[UPPER[:, 0], UPPER[:, 1]] = p[:6]
-    _, jacobian = whitened_residual(matrix, p[6:], y, np.full(50, 10.0), reference_noise)
-    step = 1e-6
-    numeric = np.column_stack([(residual(p + step * e) - residual(p - step * e)) / (2 * step) for e in np.eye(9)])
-    np.testing.assert_allclose(jacobian, numeric, atol=1e-7 * np.abs(numeric).max())
+    numeric = np.array([(at(1e-5 * e) - at(-1e-5 * e)) / 4e-5 for e in np.eye(9)])
+    np.testing.assert_allclose(found.gradient, numeric, atol=1e-6 * np.abs(numeric).max())
+
+
+def test_normal_matrix_is_the_curvature_without_noise() -> None:
+    u = np.random.default_rng(4).standard_normal((60, 3))
+    field = np.linspace(9.0, 11.0, 60)
+    matrix, offset = np.array([[1.1, 0.2, -0.1], [0.0, 0.9, 0.3], [0.1, 0.0, 1.3]]), np.array([0.4, -0.5, 0.6])
+    b = field[:, None] * u / np.linalg.norm(u, axis=1, keepdims=True)
+    y = b @ np.linalg.inv(matrix).T + offset
+    found = scores(along(matrix, offset, y.T, field, 0.3), field)
+
+    def at(step: Array) -> float:
+        return cost(*changed(matrix, offset, step), y, field, 0.3)
+
+    h, axes = 1e-4, np.eye(9)
+    curvature = [
+        [
+            (at(h * (a + b)) - at(h * (a - b)) - at(h * (b - a)) + at(-h * (a + b))) / (8 * h**2)
+            for b in axes
+        ]
+        for a in axes
+    ]  # fmt: skip
+    np.testing.assert_allclose(found.normal, curvature, atol=1e-5 * np.abs(curvature).max())
+    z = np.column_stack([b, np.ones(60)])
+    np.testing.assert_allclose(found.moments, z.T @ z, rtol=1e-12, atol=1e-9)
 
 
 def test_scalar_fit_is_a_minimum() -> None:
@@ -43,11 +83,14 @@ def test_scalar_fit_is_a_minimum() -> None:
     y = 20.0 * u / np.linalg.norm(u, axis=1, keepdims=True) + rng.standard_normal((300, 3))
     field = np.full(300, 20.0)
     fit = fit_scalar(y, field)
-    r, jacobian = whitened_residual(fit.matrix, fit.offset, y, field, 0.0)
-    information = jacobian.T @ jacobian
-    # the step a Newton iteration would still make, in standard deviations
-    left = np.linalg.solve(information, jacobian.T @ r) * np.sqrt(np.diag(information))
-    assert np.abs(left).max() < 1e-3
+    least = cost(fit.matrix, fit.offset, y, field, 0.0)
+    assert fit.chi2 == pytest.approx(least / 291, rel=1e-12)
+    std = np.sqrt(np.diag(np.linalg.inv(fit.scores.normal)))
+    for e in np.eye(9):
+        up, down = (cost(*changed(fit.matrix, fit.offset, s * 0.1 * std * e), y, field, 0.0) for s in (1, -1))
+        # a tenth of a standard deviation raises the cost by 0.01 and more; the minimum lies within a thousandth
+        assert min(up, down) > least
+        assert abs(up - down) / (up + down - 2 * least) < 0.05
 
 
 def test_common_field_is_the_plane_of_the_outputs() -> None:

@@ -12,6 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from magtensor.errors import NotEnoughData
 
@@ -72,11 +73,11 @@ def common_field(raw: Array, noise: Array | None = None, keep: Mask | None = Non
             f"{count} samples cannot tell the field from the sensors", hint="five attitudes are the least"
         )
     mean, moments = _moments(used)
-    if noise is not None:
-        sd = np.asarray(noise, dtype=float).ravel()
+    sd = np.ones(size) if noise is None else np.asarray(noise, dtype=float).ravel()
+    if size == 3:
+        basis, own = np.eye(3), np.zeros((3, 3))
+    elif noise is not None:
         basis, own = _plane(moments / np.outer(sd, sd))
-    elif size == 3:
-        sd, basis, own = np.ones(3), np.eye(3), np.zeros((3, 3))
     else:
         sd, basis, own = _with_noise(moments, count)
     if size > 3:
@@ -87,7 +88,7 @@ def common_field(raw: Array, noise: Array | None = None, keep: Mask | None = Non
     return CommonField(sd, _handed(basis), mean / sd, count, chi2)
 
 
-def output_noise(raw: Array, keep: Mask | None = None) -> Array:
+def output_noise(raw: Array, keep: Mask | None = None, run: NDArray[np.int_] | None = None) -> Array:
     """White noise (S, 3) nT of every output, from what second differences in time have in common and have not.
 
     Second differences (over sqrt 6) of the outputs share a plane as the outputs do, and hold nothing slower than a
@@ -97,12 +98,16 @@ def output_noise(raw: Array, keep: Mask | None = None) -> Array:
     ----------
     raw: (N, S, 3) nT, finite.
     keep: (N,) samples to use; a difference that touches another one is left out where enough of them remain.
+    run: (N,) which samples follow each other in time; so is a difference of different runs.
 
     Raises
     ------
     NotEnoughData: as in `common_field`.
     """
     among = None if keep is None else keep[:-2] & keep[1:-1] & keep[2:]
+    if run is not None:
+        within = run[2:] == run[:-2]
+        among = within if among is None else among & within
     if among is not None and among.sum() < LEAST_SAMPLES_PER_AXIS:
         among = None
     return common_field(np.diff(raw, n=2, axis=0) / np.sqrt(6.0), keep=among).noise.reshape(raw.shape[1], 3)

@@ -147,6 +147,7 @@ def coverage(
     offset: Array | None = None,
     worst_error: float = WORST_ERROR,
     noise: float | None = None,
+    stands_for: int | None = None,
 ) -> Coverage:
     """Judge the attitudes of one sensor, with the fit where there is one.
 
@@ -158,7 +159,9 @@ def coverage(
     worst_error: accepted error of |b| in the worst direction, as a fraction of F.
     noise: nT, of the samples, where it is known otherwise than by their distance to the surface: a misfit that the
         model has yet to explain is then not taken for it.
+    stands_for: of how many samples these are an even selection; all of them entered the fit.
     """
+    count = len(raw) if stands_for is None else stands_for
     field = float(np.mean(total_field))
     centre = np.zeros(3) if offset is None else offset
     points = (centre + (raw - centre) * (field / total_field)[:, None]) / field
@@ -176,11 +179,11 @@ def coverage(
         b = (raw - centre) @ matrix.T
         attitude = _attitude_design(b / np.linalg.norm(b, axis=1, keepdims=True))
         condition = _condition(attitude) if believable else condition
-        scatter = _scatter(attitude, matrix, centre, raw, total_field)
+        scatter = _scatter(attitude, matrix, centre, raw, total_field) * np.sqrt(len(raw) / count)
         worst = float(np.hypot(scatter, _bias(matrix, centre / field, nearest.coefficients) * field))
     thinned = directions[_distinct(directions, 0.02)]
     return Coverage(
-        samples=len(raw),
+        samples=count,
         distinct=len(_distinct(points, SAME_ATTITUDE)),
         condition_number=condition,
         distance=first * field,

@@ -6,11 +6,15 @@ position in that plane is one three-axis sensor, better than any single one, whi
 (`maximum_likelihood`). The two parts meet only in products of noise with noise over F, so solving one after the
 other is the joint maximum-likelihood estimate; two-step methods lose because they calibrate each sensor against
 the total field before they use what the sensors have in common (METHODS A4.8).
+
+Up to `AT_ONCE` samples are fitted together. A longer recording is begun with an even selection of it, which also
+tells the noise, and finished in one reading of the whole (`whole_record`): memory does not grow with its length.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -18,17 +22,19 @@ from magtensor.errors import DataError, NotEnoughData
 
 from .agreement import require_agreement
 from .axes import mirrored_words, turned_words
-from .common_field import CommonField, common_field, output_noise
+from .common_field import CommonField
 from .coverage import WORST_ERROR, coverage, require_coverage
-from .maximum_likelihood import ScalarFit, fit_scalar
-from .noise import noise_std, shares_of_two
-from .scalar import checked_samples
+from .joint_covariance import forward_covariance
+from .joint_together import Together, fit_together, limits_of, unfolded
+from .maximum_likelihood import ScalarFit
+from .noise import noise_std
+from .recording import InMemory, Recording, even_blocks, selected
 from .types import Array, ArrayCalibration, Mask
+from .whole_record import fit_whole
 
-FALSE_REJECTION = 0.01  # probability that one clean sample of the whole survey is rejected
-LEAST_FOR_REJECTION = 50  # with fewer samples the fit bends to an outlier, and no residual can tell which it was
-_TOLD_APART = 2  # rounds after which the noise of two sensors no longer moves
-_CHUNK = 65536
+AT_ONCE = 65_536  # samples of a recording that is fitted without a selection
+SELECTION = 16_384  # samples that a longer one begins with
+LARGEST_SELECTION = 2_000_000  # where the attitudes of smaller ones do not suffice
 
 
 @dataclass(frozen=True)
@@ -48,9 +54,16 @@ class JointFit:
     keep: Mask
 
 
-def fit_joint(
-    raw: Array,
-    total_field: Array,
+def fit_joint(raw: Array, total_field: Array, **options: Any) -> JointFit:
+    """Fit C and o of all sensors to their outputs raw (N, S, 3) nT, finite, and the total field (N,) nT, positive.
+
+    The options, and what is refused, are those of `fit_recording`.
+    """
+    return fit_recording(InMemory(raw, total_field), **options)
+
+
+def fit_recording(
+    recording: Recording,
     *,
     noise: Array | None = None,
     reference_noise: float = 0.0,
@@ -59,12 +72,10 @@ def fit_joint(
     keep: Mask | None = None,
     complete: bool = True,
 ) -> JointFit:
-    """Fit C and o of all sensors to their outputs and the total field.
+    """Fit C and o of all sensors to a recording of their outputs and the total field.
 
     Parameters
     ----------
-    raw: (N, S, 3) nT, finite.
-    total_field: (N,) nT, positive.
     noise: (S, 3) nT of the raw outputs; when None that of second differences, with few samples of the residual.
     reference_noise: nT, white, of the total field.
     robust: leave out samples that no noise explains.
@@ -78,65 +89,67 @@ def fit_joint(
     NotEnoughData: the attitudes do not determine the parameters; the message says which are missing.
     DataError: a mirrored sensor, or one that does not see the field of the others.
     """
-    checked_samples(raw[:, 0], total_field)
-    judge = keep is None and robust and len(raw) >= LEAST_FOR_REJECTION
-    keep = np.ones(len(raw), dtype=bool) if keep is None else keep
-    sensors = raw.shape[1]
-    own_noise = noise is None and sensors > 1 and len(raw) >= LEAST_FOR_REJECTION
-    given = output_noise(raw, keep) if own_noise else noise
-    two = sensors == 2 and noise is None and given is not None
-    for round_ in range(20):
-        plane = common_field(raw, given, keep)
-        y = plane.coordinates(raw)
+    judge = robust and keep is None
+    allowed = np.ones(recording.count, dtype=bool) if keep is None else keep
+    if recording.usable is not None:
+        allowed = allowed & recording.usable
+    among = np.flatnonzero(allowed)
+    samples = len(among) if len(among) <= AT_ONCE else SELECTION
+    while True:
+        chosen = among[even_blocks(len(among), samples)]
         try:
-            scalar = fit_scalar(y[keep], total_field[keep], reference_noise)
-        except DataError:
-            require_coverage(coverage(raw[keep, 0], total_field[keep]))
-            raise
-        if sensors == 1 and noise is None:
-            # one sensor has no neighbour to find its noise by: the residual along the field is all there is
-            given = np.full((1, 3), float(plane.noise[0]) * np.sqrt(scalar.chi2))
-            plane = common_field(raw, given, keep)
-            y = plane.coordinates(raw)
-            scalar = fit_scalar(y[keep], total_field[keep], reference_noise)
-        if two and given is not None and round_ < _TOLD_APART:
-            given = _told_apart(given, _unfold(plane, scalar, sensors), raw, total_field)
-            continue
-        if not judge:
-            break
-        again = _believable(plane, scalar, raw, total_field, reference_noise, keep)
-        if np.array_equal(again, keep):
-            break
-        if again.sum() < 0.5 * len(raw):
-            raise NotEnoughData(
-                "more than half of the samples disagree with any one calibration",
-                hint="look for a moving magnetic object, a dead axis or wrong units",
+            part = Together(*selected(recording, chosen), np.cumsum(np.diff(chosen, prepend=-1) != 1))
+            begun = fit_together(part, noise=noise, reference_noise=reference_noise, judge=judge)
+            level = None if complete else _level(part, begun.plane, begun.scalar, begun.keep)
+            if len(chosen) == len(among):
+                used = np.zeros(recording.count, dtype=bool)
+                used[chosen] = begun.keep
+                raw, total_field = part.raw[begun.keep], part.total_field[begun.keep]
+                return _accepted(begun.plane, begun.scalar, used, raw, total_field, worst_error, level)
+            limits = limits_of(begun, part, reference_noise, len(among)) if judge else None
+            whole = fit_whole(
+                recording, begun.plane, begun.scalar, limits=limits, reference_noise=reference_noise, keep=allowed
             )
-        keep = again
-        if own_noise:
-            given = output_noise(raw, keep)  # a spike passes for noise until it is left out
-            if two:
-                given = _told_apart(given, _unfold(plane, scalar, sensors), raw, total_field)
-        elif sensors == 1 and noise is None:
-            given = None
-    forward, offset = _unfold(plane, scalar, sensors)
+            return _accepted(whole.plane, whole.scalar, whole.keep, whole.raw, whole.total_field, worst_error, level)
+        except NotEnoughData:
+            # what a selection lacks, the rest may hold
+            if len(chosen) == len(among) or samples >= LARGEST_SELECTION:
+                raise
+            samples *= 8
+
+
+def _accepted(
+    plane: CommonField,
+    scalar: ScalarFit,
+    keep: Mask,
+    raw: Array,
+    total_field: Array,
+    worst_error: float,
+    level: float | None,
+) -> JointFit:
+    """The fit, once the samples raw (n, S, 3) and total_field (n,), an even choice of those used, have been found to
+    determine it."""
+    forward, offset = unfolded(plane, scalar)
     # judged on the calibrated field, whose axes are nearest to those of the sensors
-    field = (y[keep] - scalar.offset) @ scalar.matrix.T @ nearest_frame(forward)
-    reference = total_field[keep]
-    level = None if complete else float(noise_std(field[:, None], reference)[0, 0])
-    require_coverage(
-        coverage(field, reference, matrix=np.eye(3), offset=np.zeros(3), worst_error=worst_error, noise=level)
+    field = scalar.field(plane.coordinates(raw)) @ nearest_frame(forward)
+    found = coverage(
+        field,
+        total_field,
+        matrix=np.eye(3),
+        offset=np.zeros(3),
+        worst_error=worst_error,
+        noise=level,
+        stands_for=int(keep.sum()),
     )
-    _refuse_sensors(forward, offset, raw[keep], total_field[keep])
+    require_coverage(found)
+    _refuse_sensors(forward, offset, raw, total_field)
     return JointFit(forward, offset, plane, scalar, keep)
 
 
-def _told_apart(noise: Array, found: tuple[Array, Array], raw: Array, total_field: Array) -> Array:
-    """(2, 3) nT: the noise that two sensors' contrast shows, given to each as the total field tells them apart."""
-    forward, offset = found
-    b = np.einsum("sij,nsj->nsi", np.linalg.pinv(forward, rcond=1e-9), raw - offset)
-    out: Array = np.sqrt(np.sum(noise**2, axis=0) * shares_of_two(b, total_field)[:, None])
-    return out
+def _level(part: Together, plane: CommonField, scalar: ScalarFit, keep: Mask) -> float:
+    """nT, the noise of the calibrated field at the highest frequencies."""
+    field = scalar.field(plane.coordinates(part.raw[keep]))
+    return float(noise_std(field[:, None], part.total_field[keep])[0, 0])
 
 
 def _refuse_sensors(forward: Array, offset: Array, raw: Array, total_field: Array) -> None:
@@ -151,47 +164,6 @@ def _refuse_sensors(forward: Array, offset: Array, raw: Array, total_field: Arra
         )
 
 
-def _unfold(plane: CommonField, scalar: ScalarFit, sensors: int) -> tuple[Array, Array]:
-    """C (S, 3, 3) and o (S, 3) nT of every sensor from the plane and the calibration in it."""
-    c = plane.basis @ np.linalg.inv(scalar.matrix)
-    off_plane = plane.mean - plane.basis @ (plane.basis.T @ plane.mean)
-    o = plane.basis @ scalar.offset + off_plane
-    return (c * plane.noise[:, None]).reshape(sensors, 3, 3), (o * plane.noise).reshape(sensors, 3)
-
-
-def _believable(
-    plane: CommonField, scalar: ScalarFit, raw: Array, total_field: Array, reference_noise: float, keep: Mask
-) -> Mask:
-    """(N,) samples whose squared whitened residual noise explains, at `FALSE_REJECTION` for the whole survey.
-
-    Scaled by the median, so that outliers cannot hide each other.
-    """
-    from scipy.stats import chi2
-
-    n, size = len(raw), raw.shape[1] * 3
-    groups = []
-    along = np.empty(n)
-    across = np.zeros(n)
-    for start in range(0, n, _CHUNK):
-        part = slice(start, start + _CHUNK)
-        b = (plane.coordinates(raw[part]) - scalar.offset) @ scalar.matrix.T
-        length = np.linalg.norm(b, axis=1)
-        g = (b / length[:, None]) @ scalar.matrix
-        variance = np.einsum("ni,ni->n", g, g) + reference_noise**2
-        along[part] = (length - total_field[part]) ** 2 / variance
-        if size > 3:
-            across[part] = np.sum(plane.residual(raw[part]) ** 2, axis=1)
-    groups.append((along, 1))
-    if size > 3:
-        groups.append((across, size - 3))
-    good = np.ones(n, dtype=bool)
-    for values, freedom in groups:
-        scale = np.median(values) / chi2.median(freedom)
-        limit = chi2.isf(FALSE_REJECTION / (n * len(groups)), freedom)
-        good &= values <= limit * max(scale, 1e-300)
-    return good
-
-
 def nearest_frame(forward: Array) -> Array:
     """The rotation Q (3, 3) that brings all C_s Q together as near to the identity as they get.
 
@@ -203,11 +175,11 @@ def nearest_frame(forward: Array) -> Array:
     return q
 
 
-def calibrated(fit: JointFit, total_field: Array, raw: Array, reference_noise: float = 0.0) -> ArrayCalibration:
+def calibrated(fit: JointFit) -> ArrayCalibration:
     """The fit as corrections in the frame nearest to the raw axes, with the covariance of all 12 S parameters."""
     q = nearest_frame(fit.forward)
     forward = fit.forward @ q
-    covariance = _forward_covariance(fit, q, raw, total_field, reference_noise)
+    covariance = forward_covariance(fit.plane, fit.scalar, forward, q)
     matrix = np.asarray(np.linalg.inv(forward), dtype=np.float64)
     size = 12 * len(forward)
     to_matrix = np.zeros((size, size))
@@ -231,82 +203,3 @@ def calibrated(fit: JointFit, total_field: Array, raw: Array, reference_noise: f
         },
         fit.keep,
     )
-
-
-def _forward_covariance(fit: JointFit, q: Array, raw: Array, total_field: Array, reference_noise: float) -> Array:
-    """Covariance (12 S, 12 S) of C Q (row by row) and o of each sensor, in the frame of `nearest_frame`.
-
-    In whitened outputs a change W (3 S, 4) of [C | o] moves a sample by W z, z = (b, 1). Perpendicular to the
-    plane its information is sum(z z') for every direction; within the plane only u' U V' W z / spread is seen,
-    which the rotation of b leaves unchanged: the three directions of the gauge have no information and are then
-    fixed by the frame's own condition.
-    """
-    plane, scalar = fit.plane, fit.scalar
-    sensors, size = len(fit.forward), 3 * len(fit.forward)
-    moments, inner = np.zeros((4, 4)), np.zeros((12, 12))
-    used, field = raw[fit.keep], total_field[fit.keep]
-    for start in range(0, len(used), _CHUNK):
-        part = slice(start, start + _CHUNK)
-        b = (plane.coordinates(used[part]) - scalar.offset) @ scalar.matrix.T
-        length = np.linalg.norm(b, axis=1, keepdims=True)
-        u = b / length
-        g = u @ scalar.matrix
-        spread = np.sqrt(np.einsum("ni,ni->n", g, g) + reference_noise**2)
-        z = np.column_stack([u * field[part, None] @ q, np.ones(len(b))])
-        moments += z.T @ z
-        rows = np.einsum("ni,nj->nij", g / spread[:, None], z).reshape(len(z), 12)
-        inner += rows.T @ rows
-    # within the plane: parameters A = V' W (3, 4), row by row
-    inverse_moments = np.linalg.inv(moments)
-    values, vectors = np.linalg.eigh(_scaled(inner))
-    seen = values > values[-1] * 1e-12
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(inner), 1e-300))
-    root = (vectors[:, seen] / np.sqrt(values[seen])) * scale[:, None]
-    inside = root @ root.T * max(scalar.chi2, 1.0)
-    v = plane.basis
-    outside = np.eye(size) - v @ v.T
-    spread_in = np.kron(v, np.eye(4))
-    whitened = np.kron(outside, inverse_moments) + spread_in @ inside @ spread_in.T
-    d = np.kron(np.diag(plane.noise), np.eye(4))
-    covariance = d @ whitened @ d  # rows of W: output after output, [C | o] along them
-    order = [3 * s + i for s in range(sensors) for i in range(3)]
-    pick = []
-    for s in range(sensors):
-        pick += [4 * order[3 * s + i] + j for i in range(3) for j in range(3)]
-        pick += [4 * order[3 * s + i] + 3 for i in range(3)]
-    covariance = covariance[np.ix_(pick, pick)]
-    fixing = _frame_projection(fit.forward @ q)
-    out: Array = fixing @ covariance @ fixing.T
-    return out
-
-
-def _scaled(normal: Array) -> Array:
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
-    out: Array = normal * np.outer(scale, scale)
-    return out
-
-
-def _frame_projection(forward: Array) -> Array:
-    """(12 S, 12 S): adds to a change of C the rotation that keeps sum(C_s) symmetric, the condition of the frame."""
-    sensors = len(forward)
-    generators = np.zeros((3, 3, 3))
-    for k, (i, j) in enumerate(((1, 2), (2, 0), (0, 1))):
-        generators[k, i, j], generators[k, j, i] = -1.0, 1.0
-    total = forward.sum(axis=0)
-
-    def skew(a: Array) -> Array:
-        return np.array([a[2, 1] - a[1, 2], a[0, 2] - a[2, 0], a[1, 0] - a[0, 1]])
-
-    response = np.column_stack([skew(total @ g) for g in generators])
-    read = np.zeros((3, 12 * sensors))
-    move = np.zeros((12 * sensors, 3))
-    for s in range(sensors):
-        for i in range(3):
-            for j in range(3):
-                unit = np.zeros((3, 3))
-                unit[i, j] = 1.0
-                read[:, 12 * s + 3 * i + j] = skew(unit)
-        for k in range(3):
-            move[12 * s : 12 * s + 9, k] = (forward[s] @ generators[k]).ravel()
-    out: Array = np.eye(12 * sensors) - move @ np.linalg.solve(response, read)
-    return out

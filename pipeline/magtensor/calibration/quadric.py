@@ -159,7 +159,7 @@ def ellipsoid_restricted(x: Array) -> Array:
     NotAnEllipsoid: not even k = 4 gives one (the samples are degenerate).
     """
     full = design(x)
-    triangle = np.linalg.qr(np.column_stack([full[:, 6:], full[:, :6]]))[1]
+    triangle = np.asarray(np.linalg.qr(np.column_stack([full[:, 6:], full[:, :6]]), mode="r"))
     low, mixed, quad = triangle[:4, :4], triangle[:4, 4:], triangle[4:, 4:]
     _, s, vt = np.linalg.svd(quad)
     # without noise the smallest singular value is rounding; a floor keeps the division finite
