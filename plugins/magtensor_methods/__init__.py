@@ -8,6 +8,7 @@ from magtensor_methods.li2018 import li2018 as li2018
 from magtensor_methods.li2018 import li2018_linear as li2018_linear
 from magtensor_methods.li2018 import li2018_lm as li2018_lm
 from magtensor_methods.linear_regression import linear_regression as linear_regression
+from magtensor_methods.orbit_likelihood import orbit_likelihood as orbit_likelihood
 from magtensor_methods.pang2013 import pang2013 as pang2013
 from magtensor_methods.sui2017 import sui2017 as sui2017
 from magtensor_methods.tensor_cross import chi2017_cross as chi2017_cross

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from magtensor import DataError, UsageError, method
-from magtensor.tensor.elements import METRIC, five, full, rotation_of_five
+from magtensor import UsageError, method
+from magtensor.tensor.elements import full, rotation_of_five
 from magtensor.tensor.excitation import (
     cubic_excitation,
     enough_rotations,
@@ -33,27 +33,32 @@ from magtensor.tensor.invariant_polynomials import (
 )
 from magtensor.tensor.invariants import invariants
 from magtensor.tensor.refinement import (
+    LEAST_SIMILARITY,
     UNIDENTIFIED,
     TensorCalibration,
+    checked_components,
+    checked_invariants,
+    checked_prior,
     coefficient_rank,
     gauge_directions,
     gauge_projection,
     nearest_in_gauge,
-    normalised_determinant,
+    other_invariants,
+    scale_verdict,
     similarity,
 )
 
 Array = NDArray[np.float64]
 
 WORST_MISFIT = 0.3  # of the 50 equations, relative; 0.05 is what noise makes of a barely sufficient series
-LEAST_SIMILARITY = 0.8  # of H to the prior; errors of 20 degrees and 30 % leave 0.93
 
 
 @method("refine_invariants", source="Sui et al. 2017, eqs. 9-19")
 def sui2017(
     tensor: Array,
-    invariant_1: float,
-    invariant_2: float,
+    invariant_1: float | None,
+    invariant_2: float | None,
+    noise_covariance: Array | None = None,
     *,
     normalise_about: Annotated[
         Literal["mean", "zero"],
@@ -74,6 +79,7 @@ def sui2017(
     tensor : (N, 3, 3) nT/m, measured while the array rotated about its centre in one place near a source; of a
         tensor that is not symmetric and traceless the part that is so is taken.
     invariant_1, invariant_2 : I1 = -1/2 sum G^2 in (nT/m)^2 and I2 = det G in (nT/m)^3 of the true tensor there.
+    noise_covariance : not used; the paper weighs all alike.
 
     Raises
     ------
@@ -81,8 +87,13 @@ def sui2017(
         source; judged against the noise in the data.
     DataError : tensors or invariants that are impossible, or no H near the prior fits them.
     """
-    measured, magnitude, start = _checked(tensor, invariant_1, invariant_2, prior)
-    determinant = normalised_determinant(invariant_1, invariant_2)
+    if invariant_1 is None or invariant_2 is None:
+        raise UsageError(
+            "sui2017 needs invariant_1 and invariant_2; where the source is not known, orbit_likelihood does with "
+            "their being constant"
+        )
+    measured, start = checked_components(tensor), checked_prior(prior)
+    magnitude, determinant = checked_invariants(invariant_1, invariant_2)
     enough_rotations(len(measured))
     quadric = quadric_excitation(measured)
     refuse_degenerate_quadric(quadric, magnitude, abs(determinant))
@@ -97,7 +108,7 @@ def sui2017(
     rotation, angle = nearest_in_gauge(solved, start)
     matrix = rotation_of_five(rotation) @ solved
     if similarity(matrix, start) < LEAST_SIMILARITY:
-        raise _other_invariants("the H that fits resembles the prior in no orientation")
+        raise other_invariants("the H that fits resembles the prior in no orientation")
     covariance = _covariance(equations, matrix, start, offset, magnitude)
     found = invariants(full(equations.t @ matrix.T))
     residual = np.sqrt(np.mean(np.square([found.i1 + 0.5, found.i2 - equations.i2]), axis=1))
@@ -111,13 +122,13 @@ def sui2017(
         gauge=gauge_directions(matrix, -matrix @ offset),
         gauge_angle=angle,
         triaxiality=abs(determinant),
-        quadric_condition=float(np.linalg.cond(np.hstack([quadratic_monomials(equations.t), 2 * equations.t]))),
-        cubic_condition=float(np.linalg.cond(cubic_monomials(equations.t))),
         noise_std=quadric.noise_std,
         residual_rms=(float(residual[0]), float(residual[1])),
-        verdict=(UNIDENTIFIED, *_scale_verdict(equations.t, magnitude)),
+        verdict=(UNIDENTIFIED, *scale_verdict(equations.t, magnitude)),
         diagnostics={
             "rotations": float(len(measured)),
+            "quadric_condition": float(np.linalg.cond(np.hstack([quadratic_monomials(equations.t), 2 * equations.t]))),
+            "cubic_condition": float(np.linalg.cond(cubic_monomials(equations.t))),
             "quadric_above_noise": quadric.weakest,
             "quadric_needed": quadric.needed,
             "cubic_above_noise": cubic.weakest,
@@ -189,17 +200,9 @@ def solve_coefficients(y: Array, z: Array, start: Array) -> Array:
     found = least_squares(residual, start.ravel(), jacobian, method="lm", xtol=1e-12, ftol=1e-12, max_nfev=500)
     misfit = float(np.linalg.norm(found.fun) / np.linalg.norm(target))
     if misfit > WORST_MISFIT:
-        raise _other_invariants(f"the 50 equations for H stay {misfit:.0%} off")
+        raise other_invariants(f"the 50 equations for H stay {misfit:.0%} off")
     out: Array = found.x.reshape(5, 5)
     return out
-
-
-def _other_invariants(what: str) -> DataError:
-    return DataError(
-        f"the rotated tensors do not belong to these invariants: {what}",
-        where="invariant_1, invariant_2",
-        hint="check the sign and the units of I1, (nT/m)^2, and of I2, (nT/m)^3, and the prior",
-    )
 
 
 def _covariance(equations: Equations, matrix: Array, start: Array, offset: Array, magnitude: float) -> Array:
@@ -239,45 +242,3 @@ def _symmetric_matrices(coefficients: Array) -> Array:
     i, j = PAIRS.T
     out[:, i, j] = out[:, j, i] = coefficients
     return out
-
-
-def _scale_verdict(t: Array, magnitude: float) -> tuple[str, ...]:
-    seen = float(np.sqrt(np.mean(np.einsum("na,ab,nb->n", t, METRIC, t))))
-    if 0.8 < seen < 1.25:
-        return ()
-    return (
-        f"the tensors vary as if C_T were {seen * magnitude:.4g} nT/m, the invariants say {magnitude:.4g} nT/m: "
-        "H makes up for it; check the units",
-    )
-
-
-def _checked(
-    tensor: Array, invariant_1: float, invariant_2: float, prior: list[list[float]] | None
-) -> tuple[Array, float, Array]:
-    """Components (N, 5), the magnitude C_T in nT/m and the prior H (5, 5)."""
-    t = np.asarray(tensor, dtype=float)
-    if t.ndim != 3 or t.shape[1:] != (3, 3):
-        raise DataError(f"the tensor has shape {t.shape}", where="tensor", hint="(time, 3, 3) is right")
-    missing = int(np.sum(~np.isfinite(t).all(axis=(1, 2))))
-    if missing:
-        raise DataError(
-            f"{missing} of {len(t)} tensors are not finite", where="tensor", hint="leave flagged samples out"
-        )
-    if not (np.isfinite(invariant_1) and np.isfinite(invariant_2) and invariant_1 < 0):
-        raise DataError(
-            f"I1 = {invariant_1} and I2 = {invariant_2} are no invariants of a gradient tensor",
-            where="invariant_1, invariant_2",
-            hint="I1 = -1/2 sum G^2 is negative, in (nT/m)^2; I2 = det G is in (nT/m)^3",
-        )
-    determinant = normalised_determinant(invariant_1, invariant_2)
-    if abs(determinant) > 1 + 1e-6:
-        raise DataError(
-            f"no traceless tensor has I1 = {invariant_1:.6g} (nT/m)^2 and I2 = {invariant_2:.6g} (nT/m)^3: its "
-            f"determinant would be {abs(determinant):.4g} times the largest possible",
-            where="invariant_1, invariant_2",
-            hint="the two must be of the same tensor, in nT/m",
-        )
-    start = np.asarray(np.eye(5) if prior is None else prior, dtype=np.float64)
-    if start.shape != (5, 5) or not np.isfinite(start).all() or abs(np.linalg.det(start)) < 1e-6:
-        raise UsageError("prior must be an invertible matrix of 5 rows of 5 numbers, in the order xx, xy, xz, yy, yz")
-    return five(t), float(np.sqrt(-2 * invariant_1)), start

@@ -2,5 +2,6 @@
 
 from magtensor_metrics.disturbance import noise_level, outliers
 from magtensor_metrics.fit import closure, contrast, flagged, total_field
+from magtensor_metrics.refinement import refinement
 
-__all__ = ["closure", "contrast", "flagged", "noise_level", "outliers", "total_field"]
+__all__ = ["closure", "contrast", "flagged", "noise_level", "outliers", "refinement", "total_field"]

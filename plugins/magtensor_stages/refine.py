@@ -12,6 +12,7 @@ from magtensor import DataError, MethodChoice, NotEnoughData, stage
 from magtensor.calibrated import restored
 
 if TYPE_CHECKING:
+    from magtensor.calibration.types import Array
     from magtensor.survey.model import Survey
 
 
@@ -33,8 +34,14 @@ def refine_invariants(
     survey: Survey,
     *,
     method: MethodChoice = "sui2017",
-    invariant_1: Annotated[float, Field(lt=0, description="I1 = -1/2 sum G^2 at the place of rotation, (nT/m)^2")],
-    invariant_2: Annotated[float, Field(description="I2 = det G at the place of rotation, (nT/m)^3")],
+    invariant_1: Annotated[
+        float | None,
+        Field(lt=0, description="I1 = -1/2 sum G^2 at the place of rotation, (nT/m)^2; left out: constant, not known"),
+    ] = None,
+    invariant_2: Annotated[
+        float | None,
+        Field(description="I2 = det G at the place of rotation, (nT/m)^3; left out: constant, not known"),
+    ] = None,
     segments: Annotated[
         list[int] | None,
         Field(description="numbers of the segments in which the array was rotated near the source; default: all"),
@@ -43,8 +50,9 @@ def refine_invariants(
     """Refine the tensor so that its invariants stay what they are while the array rotates in one place near a source.
 
     The tensor is that of an array of sensors (`assemble_tensor`) or one measured as such (`load_tensor`). A method is
-    ``f(tensor (N, 3, 3) nT/m, invariant_1, invariant_2, *, options) -> TensorCalibration``. It leaves a common rotation
-    of the tensor's frame open, which no invariant shows.
+    ``f(tensor (N, 3, 3) nT/m, invariant_1, invariant_2, noise_covariance (5, 5) or None, *, options) ->
+    TensorCalibration``. It leaves a common rotation of the tensor's frame open, which no invariant shows, and the scale
+    where the invariants are not given.
     """
     from magtensor.tensor.elements import five
     from magtensor.tensors import assembled, refined, refinement_variables, stored_assembly
@@ -64,7 +72,7 @@ def refine_invariants(
         use &= np.isin(number, segments)
     if not use.any():
         raise NotEnoughData("refine_invariants: no sample is left in use")
-    refinement = method(tensor[use], invariant_1, invariant_2)
+    refinement = method(tensor[use], invariant_1, invariant_2, _noise_covariance(survey))
     facts = {
         "method": method.__name__,
         "rank": refinement.rank,
@@ -82,3 +90,16 @@ def refine_invariants(
     b, noise = survey.values("calibrated/b"), survey.values("calibration/noise_std")
     position = survey.values("calibration/position")
     return stored | assembled(stored_assembly(survey), b, position, noise, restored(survey), coefficients)
+
+
+def _noise_covariance(survey: Survey) -> Array | None:
+    """(5, 5) (nT/m)^2 of the components from the noise of an array's sensors; None where it is not known."""
+    from magtensor.tensor.uncertainty import noise_covariance_of_components
+    from magtensor.tensors import stored_assembly
+
+    if "calibration/tensor_gain" not in survey:
+        return None
+    noise = survey.values("calibration/noise_std")
+    if not (np.isfinite(noise) & (noise > 0)).all():
+        return None
+    return noise_covariance_of_components(stored_assembly(survey).symmetrised(), np.diag(noise.ravel() ** 2))

@@ -13,9 +13,12 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from magtensor.errors import DataError, UsageError
 from magtensor.tensor.elements import GENERATORS, METRIC, NINE_OF_FIVE, five, full, rotation_of_five
 
 Array = NDArray[np.float64]
+
+LEAST_SIMILARITY = 0.8  # of H to the prior; errors of 20 degrees and 30 % leave 0.93
 
 UNIDENTIFIED = (
     "the orientation of the corrected tensor is unidentified: rotating all of it changes no invariant; given is "
@@ -31,12 +34,12 @@ class TensorCalibration:
         matrix: (5, 5) dimensionless, H of Sui 2017 eq. 9.
         offset: (5,) nT/m, D of eq. 9.
         covariance: (30, 30) of H row by row, then D; zero along the gauge, whose choice is a convention.
-        rank, nullity: of the derivative of both invariants at all samples by the 30 coefficients.
-        gauge: (3, 30) the coefficients' change under a small rotation about x, y, z; no data determine it.
+        rank, nullity: how many of the 30 coefficients the data determine, and how many they leave open.
+        gauge: (nullity, 30) the changes of the coefficients that no data determine: a small rotation about x, y, z;
+            and a common factor where the source's magnitude was not given.
         gauge_angle: rad, by which the solver's result was turned to the representative nearest to the prior.
         triaxiality: |det G| scaled to 1 for an axisymmetric source (eigenvalues 2, -1, -1), where 15 coefficients
             are lost, and 0 where one eigenvalue vanishes and the sign of H is lost.
-        quadric_condition, cubic_condition: largest over smallest singular value of the two designs.
         noise_std: nT/m, of one component, estimated from the fit.
         residual_rms: of I1 and I2 after the correction, relative to (C_T)^2 and (C_T)^3.
         verdict: what a user has to know, in words.
@@ -51,8 +54,6 @@ class TensorCalibration:
     gauge: Array
     gauge_angle: float
     triaxiality: float
-    quadric_condition: float
-    cubic_condition: float
     noise_std: float
     residual_rms: tuple[float, float]
     verdict: tuple[str, ...]
@@ -61,6 +62,76 @@ class TensorCalibration:
     def apply(self, tensor: Array) -> Array:
         """Corrected tensors (..., 3, 3) nT/m, symmetric and traceless, from measured ones."""
         return full(five(tensor) @ self.matrix.T + self.offset)
+
+
+def checked_components(tensor: Array) -> Array:
+    """(N, 5) components of rotated tensors (N, 3, 3) nT/m.
+
+    Raises
+    ------
+    DataError : of another shape, or not finite.
+    """
+    t = np.asarray(tensor, dtype=float)
+    if t.ndim != 3 or t.shape[1:] != (3, 3):
+        raise DataError(f"the tensor has shape {t.shape}", where="tensor", hint="(time, 3, 3) is right")
+    missing = int(np.sum(~np.isfinite(t).all(axis=(1, 2))))
+    if missing:
+        raise DataError(
+            f"{missing} of {len(t)} tensors are not finite", where="tensor", hint="leave flagged samples out"
+        )
+    return five(t)
+
+
+def checked_invariants(invariant_1: float, invariant_2: float) -> tuple[float, float]:
+    """C_T in nT/m and the normalised determinant of a tensor with these invariants.
+
+    Raises
+    ------
+    DataError : no gradient tensor has them.
+    """
+    if not (np.isfinite(invariant_1) and np.isfinite(invariant_2) and invariant_1 < 0):
+        raise DataError(
+            f"I1 = {invariant_1} and I2 = {invariant_2} are no invariants of a gradient tensor",
+            where="invariant_1, invariant_2",
+            hint="I1 = -1/2 sum G^2 is negative, in (nT/m)^2; I2 = det G is in (nT/m)^3",
+        )
+    determinant = normalised_determinant(invariant_1, invariant_2)
+    if abs(determinant) > 1 + 1e-6:
+        raise DataError(
+            f"no traceless tensor has I1 = {invariant_1:.6g} (nT/m)^2 and I2 = {invariant_2:.6g} (nT/m)^3: its "
+            f"determinant would be {abs(determinant):.4g} times the largest possible",
+            where="invariant_1, invariant_2",
+            hint="the two must be of the same tensor, in nT/m",
+        )
+    return float(np.sqrt(-2 * invariant_1)), determinant
+
+
+def checked_prior(prior: list[list[float]] | None) -> Array:
+    """H (5, 5) to start from; the identity when not given."""
+    start = np.asarray(np.eye(5) if prior is None else prior, dtype=np.float64)
+    if start.shape != (5, 5) or not np.isfinite(start).all() or abs(np.linalg.det(start)) < 1e-6:
+        raise UsageError("prior must be an invertible matrix of 5 rows of 5 numbers, in the order xx, xy, xz, yy, yz")
+    return start
+
+
+def other_invariants(what: str) -> DataError:
+    """The error for tensors that do not belong to the given invariants."""
+    return DataError(
+        f"the rotated tensors do not belong to these invariants: {what}",
+        where="invariant_1, invariant_2",
+        hint="check the sign and the units of I1, (nT/m)^2, and of I2, (nT/m)^3, and the prior",
+    )
+
+
+def scale_verdict(offset_free: Array, magnitude: float) -> tuple[str, ...]:
+    """A word of warning when the measured tensors (N, 5), divided by C_T, are far from unit magnitude."""
+    seen = float(np.sqrt(np.mean(np.einsum("na,ab,nb->n", offset_free, METRIC, offset_free))))
+    if 0.8 < seen < 1.25:
+        return ()
+    return (
+        f"the tensors vary as if C_T were {seen * magnitude:.4g} nT/m, the invariants say {magnitude:.4g} nT/m: "
+        "H makes up for it; check the units",
+    )
 
 
 def normalised_determinant(invariant_1: float, invariant_2: float) -> float:
