@@ -32,8 +32,8 @@ from magtensor_methods import orbit_likelihood, sui2017
 
 Array = NDArray[np.float64]
 
-RUNS = 60
-COVERED = 500
+RUNS = 40
+COVERED = 300
 HEIGHTS = (20, 30, 40, 50, 60, 75, 100)
 COUNTS = (100, 500, 1000)
 LINE_COUNT = 500

@@ -5,9 +5,10 @@ from __future__ import annotations
 from typing import Annotated
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
-from magtensor import NotEnoughData, UsageError, method
+from magtensor import DataError, NotEnoughData, UsageError, method
 from magtensor.calibration.types import Array
 from magtensor.tensor.elements import METRIC, full, rotation_of_five
 from magtensor.tensor.excitation import quadric_excitation
@@ -92,57 +93,46 @@ def orbit_likelihood(
     measured, start = checked_components(tensor), checked_prior(prior)
     if invariant_1 is None and invariant_2 is not None:
         raise UsageError("invariant_2 is given without invariant_1; give both, I1 alone, or neither")
-    if len(measured) < LEAST_ROTATIONS:
-        raise NotEnoughData(
-            f"{len(measured)} rotations cannot determine 27 coefficients: each gives two equations",
-            where="tensor",
-            hint=f"at least {LEAST_ROTATIONS} rotations are needed, a hundred are right",
-        )
+    _refuse_few(len(measured))
     magnitude, angle = _source(invariant_1, invariant_2)
     unit = magnitude or float(np.sqrt(np.mean(np.var(measured, axis=0) @ np.diag(METRIC)))) or 1.0
     spread = np.eye(5) if noise_covariance is None else noise_covariance / np.mean(np.diag(noise_covariance))
     whiten = np.linalg.inv(np.linalg.cholesky(spread))
-    readings = measured @ whiten.T / unit
-
+    readings, mixing_prior = measured @ whiten.T / unit, whiten @ np.linalg.inv(start)
     first = near(readings) if robust else np.ones(len(readings), dtype=bool)
     quadric_noise = _noise_of_moving(measured[first], magnitude)
-    surface = search(readings[first], whiten @ np.linalg.inv(start), angle)
-    kept = explicable(readings, surface) if robust else first
-    if (kept != first).any():
-        surface = search(readings[kept], whiten @ np.linalg.inv(start), angle)
-        kept = explicable(readings, surface)
-    found = Likelihood.at(readings[kept], surface, angle is not None)
-    judged = determination(found)
-    if judged.weakest < judged.needed:
-        if angle is not None:
-            _refuse_other_shape(readings[kept], whiten @ np.linalg.inv(start), found)
-        raise _undetermined(judged, found)
-    found = corrected(readings[kept], found.surface, angle is not None)
+    found, judged, kept = _fit(readings, mixing_prior, angle, first, robust)
 
-    mixing = np.linalg.solve(whiten, found.surface.mixing)
     offset = unit * np.linalg.inv(whiten) @ found.surface.offset
-    solved = np.linalg.inv(mixing)
-    scale = 1.0 if magnitude else abs(np.linalg.det(start) / np.linalg.det(solved)) ** 0.2
+    solved = np.asarray(np.linalg.inv(found.surface.mixing) @ whiten)
+    scale = 1.0 if magnitude else float(abs(np.linalg.det(start) / np.linalg.det(solved)) ** 0.2)
     rotation, turned = nearest_in_gauge(scale * solved, start)
     matrix = scale * rotation_of_five(rotation) @ solved
-    noise = float(np.sqrt(found.variance)) * unit
     if similarity(matrix, start) < LEAST_SIMILARITY:
-        raise other_invariants("the H that fits resembles the prior in no orientation")
+        if magnitude:
+            raise other_invariants("the H that fits resembles the prior in no orientation")
+        raise DataError(
+            "the H that keeps the invariants constant resembles the prior in no orientation",
+            where="tensor",
+            hint="check the order, signs and units of the components, and the prior",
+        )
     gauge = gauge_directions(matrix, -matrix @ offset)
     if not magnitude:
         gauge = np.vstack([gauge, np.concatenate([matrix.ravel(), -matrix @ offset])])
-    shape = np.cos(3 * found.surface.angle)
-    shape_error, shape_std = shape_offset(found)
+    noise = float(np.sqrt(found.variance)) * unit
+    shape, shape_step, shape_std = found.surface.angle, *shape_offset(found)
     verdict = [UNIDENTIFIED]
-    if not magnitude:
+    if magnitude:
+        verdict += scale_verdict((measured[kept] - offset) / magnitude, magnitude)
+    else:
         verdict.append(SCALE_UNIDENTIFIED)
-    if abs(np.pi / 6 - found.surface.angle) < SIGNIFICANT * shape_std:
+    if abs(np.pi / 6 - shape) < SIGNIFICANT * shape_std:
         verdict.append(SIGN_OF_THE_PRIOR)
-    if angle is not None and abs(shape_error) > SIGNIFICANT * shape_std:
-        _refuse_other_shape(readings[kept], whiten @ np.linalg.inv(start), found)
+    if angle is not None and abs(shape_step) > SIGNIFICANT * shape_std:
+        _refuse_other_shape(readings[kept], mixing_prior, found)
         verdict.append(
-            f"the tensors ask for a normalised determinant of {np.cos(3 * (angle + shape_error)):.4f}, the invariants "
-            f"give {shape:.4f}, {abs(shape_error) / shape_std:.1f} standard deviations apart: check I1 and I2"
+            f"the tensors ask for a normalised determinant of {np.cos(3 * (angle + shape_step)):.4f}, the invariants "
+            f"give {np.cos(3 * angle):.4f}, {abs(shape_step) / shape_std:.1f} standard deviations apart: check them"
         )
     if noise > NOISE_TWICE * quadric_noise:
         verdict.append(
@@ -151,12 +141,9 @@ def orbit_likelihood(
         )
     if not kept.all():
         verdict.append(f"{np.sum(~kept)} of {len(kept)} rotations left out: no noise explains them")
-    whole = invariants(full((measured[kept] - offset) @ matrix.T))
-    size = float(scale * unit)
-    i2 = shape / (3 * np.sqrt(6))
-    residual = [whole.i1 / size**2 + 0.5, whole.i2 / size**3 - i2]
-    if magnitude:
-        verdict += scale_verdict((measured[kept] - offset) / magnitude, magnitude)
+    corrected_ones = invariants(full((measured[kept] - offset) @ matrix.T))
+    size, determinant = scale * unit, float(np.cos(3 * shape))
+    residual = [corrected_ones.i1 / size**2 + 0.5, corrected_ones.i2 / size**3 - determinant / (3 * np.sqrt(6))]
     return TensorCalibration(
         matrix=matrix,
         offset=-matrix @ offset,
@@ -165,7 +152,7 @@ def orbit_likelihood(
         nullity=len(gauge),
         gauge=gauge,
         gauge_angle=turned,
-        triaxiality=abs(float(shape)),
+        triaxiality=abs(determinant),
         noise_std=noise,
         residual_rms=(float(np.sqrt(np.mean(residual[0] ** 2))), float(np.sqrt(np.mean(residual[1] ** 2)))),
         verdict=tuple(verdict),
@@ -175,10 +162,39 @@ def orbit_likelihood(
             "information_above_noise": judged.weakest,
             "information_needed": judged.needed,
             "narrowest_radius_in_noise": judged.narrowest,
-            "normalised_determinant": float(shape),
-            "normalised_determinant_std": float(3 * abs(np.sin(3 * found.surface.angle)) * shape_std),
+            "normalised_determinant": determinant,
+            "normalised_determinant_std": float(3 * abs(np.sin(3 * shape)) * shape_std),
         },
     )
+
+
+def _fit(
+    readings: Array, prior: Array, angle: float | None, first: NDArray[np.bool_], robust: bool
+) -> tuple[Likelihood, Determination, NDArray[np.bool_]]:
+    """The maximum, its determination, and the readings kept."""
+    surface = search(readings[first], prior, angle)
+    kept = explicable(readings, surface) if robust else first
+    if (kept != first).any():
+        _refuse_few(int(kept.sum()))
+        surface = search(readings[kept], prior, angle)
+        kept = explicable(readings, surface)
+        _refuse_few(int(kept.sum()))
+    found = Likelihood.at(readings[kept], surface, angle is not None)
+    judged = determination(found)
+    if judged.weakest < judged.needed:
+        if angle is not None:
+            _refuse_other_shape(readings[kept], prior, found)
+        raise _undetermined(judged, found)
+    return corrected(readings[kept], surface, angle is not None), judged, kept
+
+
+def _refuse_few(count: int) -> None:
+    if count < LEAST_ROTATIONS:
+        raise NotEnoughData(
+            f"{count} rotations cannot determine 27 coefficients: each gives two equations",
+            where="tensor",
+            hint=f"at least {LEAST_ROTATIONS} rotations are needed, a hundred are right",
+        )
 
 
 def _source(invariant_1: float | None, invariant_2: float | None) -> tuple[float | None, float | None]:

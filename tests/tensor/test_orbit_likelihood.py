@@ -256,7 +256,7 @@ def standardised(found, gradiometer, known):
 
 @pytest.mark.parametrize("known", [True, False])
 def test_standard_errors_and_intervals_are_true(known):
-    """60 series of a hundred rotations; 500 in studies/sui_likelihood.py.
+    """60 series of a hundred rotations; 300 in studies/sui_likelihood.py.
 
     Of 60 times 27 whitened errors the mean square has a standard deviation of .035, the coverage one of .0055; of the
     30 plain ones, which correlate, some twice that.
