@@ -4,6 +4,7 @@ from magtensor_effects.ageing import offset_drift, offset_step, scale_drift, war
 from magtensor_effects.channels import channel_response, moving_part, periodic_interference
 from magtensor_effects.geometry import baseline_expansion, finite_baseline, position_error
 from magtensor_effects.inertia import bandwidth, clock_drift, eddy_current, sampling_lag, viscous_magnetisation
+from magtensor_effects.latent import latent_source
 from magtensor_effects.mechanics import crosstalk, frame_flexure
 from magtensor_effects.power import current_field, supply_offset, supply_scale
 from magtensor_effects.reference import reference_clock, reference_scale, reference_step
@@ -24,6 +25,7 @@ __all__ = [
     "fixed_source",
     "frame_flexure",
     "hysteresis",
+    "latent_source",
     "moving_part",
     "nonlinearity_cubic",
     "nonlinearity_quadratic",

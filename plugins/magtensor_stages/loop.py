@@ -42,6 +42,7 @@ def close_loop(
     that may be adopted, all that are installed if left out.
     """
     from magtensor.calibration.joint import calibrated
+    from magtensor.loop.correction import as_elsewhere
     from magtensor.loop.errors_before_after import held_out_error
     from magtensor.loop.model import Adopted, Fitting, require_determined
     from magtensor.loop.outcome import described
@@ -58,7 +59,7 @@ def close_loop(
     names = {a.name for a in begin}
     models = [component for name, (component, _) in dict(search or {}).items() if name not in names]
     found = find(record, models, how, declared=begin, most_effects=most_effects, alpha=false_alarm)
-    first, last = found.first, found.last
+    first, last, record = found.first, found.last, found.record
     require_determined(record, last, how)
     calibration = calibrated(last.fit)
     outcome = {
@@ -69,7 +70,8 @@ def close_loop(
     keep = last.fit.keep
     before = held_out_error(record, begin, how, first.theta, keep)
     same = len(last.adopted) == len(begin)
-    after = before if same else held_out_error(record, last.adopted, how, last.theta, keep)
+    seen = as_elsewhere(record, calibration, last)
+    after = before if same else held_out_error(seen, last.adopted, how, last.theta, keep)
     outcome["held_out"] = {"before": before, "after": after}
     clean = cleaned(survey, calibration, last.adopted, last.theta, record.means)
     given = common_frame(clean, calibration, "joint") | effect_variables(last.adopted, last.theta, record.means)

@@ -80,7 +80,7 @@ def colour_of(series: Array, freedom: float | None = None, *, stiff: bool = Fals
     model = level
     for _ in range(4):
         weight = np.sqrt(count / 2.0) / np.maximum(model, 1e-300)
-        found, _ = nnls(shapes * weight[:, None], level * weight)
+        found, _ = nnls(shapes * weight[:, None], level * weight, maxiter=100 * shapes.shape[1])
         model = shapes @ found
         if not model.min() > 0:
             model = np.maximum(model, 1e-12 * level.max())

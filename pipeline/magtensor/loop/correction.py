@@ -3,18 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from magtensor.calibration.types import Array, ArrayCalibration
-from magtensor.loop.model import Adopted, Record
+from magtensor.loop.model import Adopted, Record, State, without
+from magtensor.loop.waveform import NAME, course_of
+from magtensor.tensor.geometry import array_design
 
 MOST_STEPS = 8
 SETTLED_NT = 1e-4
 
 
 def corrected_raw(
-    record: Record, calibration: ArrayCalibration, adopted: Sequence[Adopted], theta: Sequence[Array]
+    record: Record,
+    calibration: ArrayCalibration,
+    adopted: Sequence[Adopted],
+    theta: Sequence[Array],
+    good: NDArray[np.bool_] | None = None,
 ) -> Array:
     """Raw outputs (N, S, 3) nT without the instrument's effects.
 
@@ -26,7 +34,15 @@ def corrected_raw(
     record: all samples of the survey, channels with the calibration's means taken off.
     calibration: C and o.
     adopted: the effects; theta: their coefficients.
+    good: (N,) samples from which the waveform of a source that nobody logged may be found.
     """
+    hidden = _hidden(adopted)
+    if hidden is not None:
+        others = [i for i in range(len(adopted)) if i != hidden]
+        left = corrected_raw(record, calibration, [adopted[i] for i in others], [theta[i] for i in others])
+        noise = np.asarray(adopted[hidden].settings["noise_nT"])
+        waveform = hidden_waveform(left, calibration, record.position, theta[hidden], noise, good)
+        record = replace(record, waveform=waveform)
     own = [(a, t) for a, t in zip(adopted, theta, strict=True) if a.component.effect == "instrument"]
     raw = record.raw
     if not own:
@@ -44,6 +60,55 @@ def corrected_raw(
         if moved < SETTLED_NT:
             break
     return raw
+
+
+def hidden_waveform(
+    raw: Array,
+    calibration: ArrayCalibration,
+    position: Array | None,
+    theta: Array,
+    noise: Array,
+    good: NDArray[np.bool_] | None = None,
+) -> Array:
+    """(N,) waveform of a source that nobody logged, from where neither a uniform field nor a gradient could make it.
+
+    So no field that a survey may hold is taken for the source. Two sensors have no such outputs, three have one in
+    each sample, and where the positions are not known nobody can say; what cannot be told is not taken off.
+
+    Parameters
+    ----------
+    raw: (N, S, 3) nT, other effects taken off.
+    theta: (3 S,) nT, what a unit of the waveform adds to the outputs; noise: (3 S,) nT of these.
+    """
+    usable: NDArray[np.bool_] = np.asarray(np.isfinite(raw).all(axis=(1, 2)))
+    if good is not None:
+        usable = usable & good
+    if position is None or not usable.any():
+        return np.zeros(len(raw))
+    forward = np.linalg.inv(calibration.matrix)
+    field = array_design(position, "gradient").reshape(len(forward), 3, -1)
+    held = np.einsum("sij,sjk->sik", forward, field).reshape(len(noise), -1) / noise[:, None]
+    whitened = (np.nan_to_num(raw) - calibration.offset).reshape(len(raw), -1) / noise
+    return course_of(whitened, held, theta / noise, usable).values
+
+
+def as_elsewhere(record: Record, calibration: ArrayCalibration, state: State) -> Record:
+    """The record with the waveform that a correction would find on another survey, which knows less of it."""
+    which = _hidden(state.adopted)
+    if which is None:
+        return record
+    others = [i for i in range(len(state.adopted)) if i != which]
+    each = [state.adopted[i].terms(state.excitation) for i in others]
+    raw, _ = without(record, each, [state.theta[i] for i in others])
+    good = np.asarray(state.fit.keep)
+    noise = np.asarray(state.adopted[which].settings["noise_nT"])
+    waveform = hidden_waveform(raw, calibration, record.position, state.theta[which], noise, good)
+    return replace(record, waveform=waveform)
+
+
+def _hidden(adopted: Sequence[Adopted]) -> int | None:
+    """Which of the models is a source that nobody logged."""
+    return next((i for i, a in enumerate(adopted) if a.name == NAME), None)
 
 
 def corrected_reference(record: Record, adopted: Sequence[Adopted], theta: Sequence[Array]) -> Array | None:

@@ -61,6 +61,7 @@ def example_survey(
         position=position,
         attitude=attitude,
         lines=LINES_HZ,
+        waveform=_smooth(time, 1, 0.04)[:, 0] if sensors > 2 else None,
     )
 
 

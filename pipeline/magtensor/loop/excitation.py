@@ -37,6 +37,7 @@ class Excitation:
         position: (S, 3) m; None where not known.
         attitude: (N, 4) scalar last, platform to world; None where not known.
         lines: Hz, the strongest lines in the residual's spectrum, for models that look for one.
+        waveform: (N,) of a source that nobody logged, found in what the sensors share; None where none was.
     """
 
     time: Array
@@ -52,6 +53,7 @@ class Excitation:
     position: Array | None = None
     attitude: Array | None = None
     lines: Sequence[float] = ()
+    waveform: Array | None = None
 
     @property
     def duration(self) -> float:

@@ -36,6 +36,7 @@ class Record:
         run, segment: (N,) as in Excitation.
         position: (S, 3) m or None; attitude: (N, 4) or None.
         samples: (N,) their numbers in the survey.
+        waveform: (N,) of a source that nobody logged, once it was found.
     """
 
     time: Array
@@ -52,6 +53,7 @@ class Record:
     position: Array | None
     attitude: Array | None
     samples: NDArray[np.int_]
+    waveform: Array | None = None
 
     def at(self, keep: NDArray[np.int_]) -> Record:
         """Some of the samples."""
@@ -66,13 +68,14 @@ class Record:
             segment=self.segment[keep],
             attitude=None if self.attitude is None else self.attitude[keep],
             samples=self.samples[keep],
+            waveform=None if self.waveform is None else self.waveform[keep],
         )
 
     def excitation(self, output: Array, field_: Array, lines: Sequence[float] = ()) -> Excitation:
         """What error models see, given the modelled outputs and fields (N, S, 3)."""
         return Excitation(
             self.time, self.start, self.sensors, output, field_, self.quiet_field, self.logged, self.units, self.run,
-            self.segment, self.position, self.attitude, tuple(lines),
+            self.segment, self.position, self.attitude, tuple(lines), self.waveform,
         )  # fmt: skip
 
 

@@ -1,7 +1,7 @@
 """Whether a survey has what an error model needs.
 
 A need is the name of a channel (`acceleration`, `current_*`), a fact of the survey (`attitude`, `position`,
-`total_field`, `rotation`, `gradient`), or several of these of which one will do (`acceleration|attitude`).
+`total_field`, `rotation`, `gradient`, `waveform`), or several of these of which one will do (`acceleration|attitude`).
 """
 
 from __future__ import annotations
@@ -40,6 +40,7 @@ FACTS: dict[str, Callable[[Excitation], bool]] = {
     "total_field": lambda x: x.total_field is not None,
     "rotation": _turns,
     "gradient": lambda x: not x.uniform,
+    "waveform": lambda x: x.waveform is not None,
 }
 
 

@@ -15,6 +15,7 @@ from magtensor.loop.search import Search, Step, put_back
 from magtensor.loop.settings import Range
 from magtensor.loop.statistics import held_out_gain
 from magtensor.loop.terms import joined
+from magtensor.loop.waveform import NAME
 
 WHITE = Colours(Colour(None, 1.0), Colour(None, 1.0))
 
@@ -57,8 +58,10 @@ def _adopted(found: Search, index: int) -> dict[str, Any]:
     std = np.sqrt(np.maximum(np.diag(state.estimate.covariance), 0.0))[part]
     names, sensors = state.terms.names[part], state.terms.sensors[part]
     units = state.terms.units[part]
-    before, after = removal(state, index)
     step = _step_of(found, model)
+    before, after = removal(state, index)
+    if step is not None and step.adopted is not None and model.name == NAME:  # its waveform has seen the data
+        before, after = (rms * step.before.residual.scale for rms in step.adopted.assessment.gain.rms)
     rivals = [] if step is None else list(step.rivals)
     p = float("nan") if step is None or step.adopted is None else step.adopted.assessment.p
     return {
@@ -110,6 +113,8 @@ def _rejected(found: Search) -> list[dict[str, Any]]:
                 last[candidate.model.name] = f"round {number}: {why(candidate, step.adopted)}"
         for name in step.dropped:
             last[name] = f"round {number}: dropped, no longer significant beside the others"
+    if found.shared is not None and found.shared.significant:
+        last[NAME] = found.shared.objection or "not among the models that may be adopted"
     for name, reason in found.failed.items():
         last.setdefault(name, f"could not be tried: {reason}")
     return [{"error_model": n, "why": w} for n, w in sorted(last.items()) if n not in adopted]

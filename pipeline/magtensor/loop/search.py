@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from magtensor.components import Component
 from magtensor.errors import DataError
 from magtensor.loop.assessment import Colours, estimated, explained
 from magtensor.loop.excitation import Excitation
+from magtensor.loop.latent import NAME, Sought, renewed, sought, tried_source
 from magtensor.loop.model import Adopted, Fitting, Record, State, joint_state
 from magtensor.loop.needs import missing
 from magtensor.loop.residual import Residual
@@ -60,13 +61,17 @@ class Search:
         steps: in order.
         not_tested: model -> what the survey lacks for it.
         failed: model -> why its regressors could not be made.
+        record: the samples, with the waveform of a source that nobody logged where one was adopted.
+        shared: the waveform that the sensors share after all that was adopted; None where it cannot be asked for.
     """
 
     first: State
     last: State
     steps: tuple[Step, ...]
     not_tested: Mapping[str, tuple[str, ...]]
-    failed: Mapping[str, str] = field(default_factory=dict)
+    failed: Mapping[str, str]
+    record: Record
+    shared: Sought | None
 
 
 def search(
@@ -95,6 +100,9 @@ def search(
         _require_channels(joint_state(record, [], how).excitation, declared)
     state = first = joint_state(record, declared, how)
     testable, not_tested = _testable(first.excitation, models)
+    hidden = next((m for m in models if m.name == NAME), None)
+    not_tested.pop(NAME, None)
+    shared: Sought | None = None
     steps: list[Step] = []
     failed: dict[str, str] = {}
     for _ in range(most_effects + 1):
@@ -106,8 +114,18 @@ def search(
         candidates = candidates_of(state, open_, failed, alpha)
         passing = [c for c in candidates if c.passes]
         if not passing:
-            steps.append(Step(state, tuple(candidates), None))
-            break
+            shared = sought(state, record)
+            source = None
+            if shared is not None and hidden is not None and NAME not in taken:
+                shared, source = tried_source(hidden, record, state, shared, how, alpha)
+            if source is None:
+                steps.append(Step(state, tuple(candidates), None))
+                break
+            if say is not None:
+                say(f"adopting {NAME}")
+            steps.append(Step(state, tuple(candidates), source.evidence))
+            record, state, shared = source.record, source.after, None
+            continue
         best = max(passing, key=lambda c: c.assessment.gain.total)
         chosen, rivals = _simplest(best, candidates, state)
         if say is not None:
@@ -117,8 +135,8 @@ def search(
         steps.append(Step(state, tuple(candidates), chosen, rivals, dropped))
         if chosen.model.name in dropped and len(after.adopted) <= len(state.adopted):
             break
-        state = after
-    return Search(first, state, tuple(steps), not_tested, failed)
+        record, state = renewed(record, after, how)
+    return Search(first, state, tuple(steps), not_tested, failed, record, shared or sought(state, record))
 
 
 def _require_channels(x: Excitation, declared: Sequence[Adopted]) -> None:

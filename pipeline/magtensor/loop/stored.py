@@ -78,7 +78,7 @@ def cleaned(
         return survey
     record = record_of(survey, means=means, every=True)
     try:
-        raw = corrected_raw(record, calibration, adopted, theta)
+        raw = corrected_raw(record, calibration, adopted, theta, survey.good)
         field = corrected_reference(record, adopted, theta)
     except (KeyError, ValueError) as error:
         raise DataError(

@@ -1,0 +1,387 @@
+"""A source nobody logged: one waveform, a vector at each sensor.
+
+What lies across the plane that all sensors share is noise of each sensor, unless something moves several of them in
+step. The test is one of factor analysis (`factor`): does the covariance of the residual, in bands of the lowest
+frequencies, ask for a factor beside noise of the sensors, of any level and correlation within one? Its proof is
+prediction: in a stretch of time each sensor's residual from that of the others, through a direction found in the other
+stretches. Two sensors have one contrast: which of them was disturbed cannot be told, so nothing is adopted.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magtensor.calibration.types import Array
+from magtensor.components import Component
+from magtensor.loop.assessment import Assessment, estimated
+from magtensor.loop.colour import colour_of
+from magtensor.loop.direction import attitude_series
+from magtensor.loop.factor import Factors, Groups, noise_alone, with_factor
+from magtensor.loop.model import Adopted, Fitting, Record, State, excitation_of, joint_state, without
+from magtensor.loop.residual import Residual
+from magtensor.loop.screening import Candidate
+from magtensor.loop.statistics import FOLDS, Gain
+from magtensor.loop.terms import joined
+from magtensor.loop.waveform import NAME, Course, course_of, free_directions
+
+ALPHA = 0.001  # family-wise over the bands
+LEAST_SENSORS = 3  # from here on noise of single sensors does not imitate a factor
+LEAST_BAND = 6  # coefficients of the lowest band for each value across
+_PARTS = 6  # of a band, in which the noise of different values may have different power
+SECOND = 0.1  # a second factor this strong beside the first: not one waveform
+LIKE_A_CHANNEL = 0.7  # correlation from which a logged channel is the suspect and no hidden source
+MOST_LAG = 0.1  # of the survey, in which a channel is compared with the waveform
+_SETTLING = 3  # rounds in which colour and field settle
+COMPARED = 400  # points at which it is
+
+
+@dataclass(frozen=True)
+class Sought:
+    """The strongest waveform that the sensors share, and what speaks for it and against it.
+
+    Attributes:
+        time: (N,) s; values: (N,) of unit rms; std: of a value.
+        direction: (S, 3) nT per unit at each sensor, as far as it shows off the common plane.
+        period_s: the shortest period in it.
+        p: that noise of the sensors alone gives so strong a one, all bands considered.
+        share: of the variance across that it explains.
+        gain: on held-out stretches, of each sensor's whitened residual predicted from the others.
+        like: channel, lag s, power and correlation of the channel it follows; None where it follows none.
+        switches: whether it has two levels.
+        objection: why it is not adopted; "" where nothing stands against it.
+    """
+
+    time: Array
+    values: Array
+    std: float
+    direction: Array
+    period_s: float
+    p: float
+    share: float
+    gain: Gain
+    like: tuple[str, float, int, float] | None
+    switches: bool
+    objection: str
+
+    @property
+    def significant(self) -> bool:
+        """Whether it is there."""
+        return self.p < ALPHA
+
+
+def sought(state: State, record: Record) -> Sought | None:
+    """Look for a waveform that the sensors share; None where there are too few sensors or samples to ask."""
+    residual = state.residual
+    if residual.across is None:
+        return None
+    held = np.eye(len(residual.noise)) - residual.projector
+    adopted = _put_back(state)
+    if adopted is not None:  # its own noise went with it
+        held = np.column_stack([held, residual.projector @ adopted[1]])
+    basis = free_directions(held)
+    n, m = len(residual.across), basis.shape[1]
+    if n <= LEAST_BAND * m:
+        return None
+    sensors = len(residual.noise) // 3
+    told = sensors >= LEAST_SENSORS
+    groups: Groups = [np.arange(3 * s, 3 * s + 3) for s in range(sensors)] if told else _outputs(basis)
+    z = residual.across @ basis
+    test = _strongest(state.colours.across.whiten(z), basis, groups)
+    factors = with_factor(test.covariance, basis, groups, test.alone)
+    course = _told_from_the_field(residual, held, factors.direction)
+    if course.rms == 0:
+        return None
+    seen = basis.T @ factors.direction * course.rms
+    time = record.time[residual.samples]
+    values = course.values / course.rms
+    inside = lowest(z, test.band)
+    gain = _predicted(inside, z - inside, basis, groups)
+    like = followed(time, values, record)
+    objection = ""
+    if not told:
+        objection = "with two sensors it cannot be told from a disturbance of one of them"
+    elif not gain.consistent:
+        objection = "the sensors do not predict each other with it on held-out stretches"
+    elif like is not None:
+        objection = f"its waveform follows channel {like[0]}"
+    elif _second(test, basis, factors) > SECOND:
+        objection = "one waveform does not explain what the sensors share"
+    return Sought(
+        time=time,
+        values=values,
+        std=course.std / course.rms,
+        direction=(basis @ seen * residual.noise).reshape(-1, 3),
+        period_s=float(np.median(np.diff(time))) / max(course.band, 0.5 / n),
+        p=test.p,
+        share=float(seen @ seen / np.mean(np.sum(z**2, axis=1))),
+        gain=gain,
+        like=like,
+        switches=course.switches,
+        objection=objection,
+    )
+
+
+@dataclass(frozen=True)
+class Source:
+    """An adopted source: the record with its waveform, the calibration with it, and the evidence."""
+
+    record: Record
+    after: State
+    evidence: Candidate
+
+
+def tried_source(
+    component: Component, record: Record, state: State, found: Sought, how: Fitting, alpha: float
+) -> tuple[Sought, Source | None]:
+    """What was found, with a last objection if there is one, and the calibration with it if there is none.
+
+    Parameters
+    ----------
+    component: the error model.
+    alpha: family-wise false-alarm probability.
+    """
+    if found.objection or found.p >= min(alpha, ALPHA):
+        return found, None
+    record = replace(record, waveform=np.interp(record.time, found.time, found.values))
+    model = Adopted(component, {})
+    every = model.terms(replace(state.excitation, waveform=record.waveform))
+    terms = every.at(state.residual.samples)
+    together = terms if state.terms is None else joined([terms, state.terms])
+    estimate = estimated(state.residual, together, state.colours)
+    after = joint_state(record, [*state.adopted, model], how, [*state.theta, np.zeros(every.count)])
+    record, after = renewed(record, after, how)
+    if _turning(record, after):
+        return replace(found, objection="its waveform follows the direction of the field"), None
+    model = Adopted(component, {"noise_nT": [float(v) for v in after.residual.noise]})
+    after = replace(after, adopted=(*after.adopted[:-1], model))
+    evidence = Assessment(estimate, found.gain, found.gain, found.p, state.colours)
+    return found, Source(record, after, Candidate(model, 1, terms, evidence, found.p, ALPHA))
+
+
+def _told_from_the_field(residual: Residual, held: Array, direction: Array) -> Course:
+    """The waveform in a residual whose fit took some of it for the field.
+
+    Where the source is strong, C and o have followed it along its direction. What of it goes with the field is told
+    apart by its colour: generalised least squares, the colour found anew when that part has gone.
+    """
+    assert residual.across is not None
+    free = free_directions(held)
+    seen = free @ (free.T @ direction)
+    series = residual.across @ seen / (seen @ seen)
+    left = series
+    for _ in range(_SETTLING):
+        colour = colour_of(left[:, None])
+        taken = np.linalg.lstsq(colour.whiten(residual.affine), colour.whiten(series), rcond=1e-12)[0]
+        left = series - residual.affine @ taken
+    return course_of(residual.across + np.outer(left - series, seen), held, direction)
+
+
+def renewed(record: Record, state: State, how: Fitting) -> tuple[Record, State]:
+    """The waveform once more, from a calibration that knows the source or another effect better, and a refit."""
+    found = _put_back(state)
+    if found is None:
+        return record, state
+    across, direction = found
+    course = course_of(across, np.eye(len(direction)) - state.residual.projector, direction)
+    if course.rms == 0:
+        return record, state
+    waveform = np.interp(record.time, record.time[state.residual.samples], course.values / course.rms)
+    record = replace(record, waveform=waveform)
+    return record, joint_state(record, state.adopted, how, state.theta, state.lines)
+
+
+def _put_back(state: State) -> tuple[Array, Array] | None:
+    """The whitened residual across (N, 3 S) with the adopted source left in it, and its direction (3 S,)."""
+    which = next((i for i, a in enumerate(state.adopted) if a.name == NAME), None)
+    if which is None:
+        return None
+    residual, theta = state.residual, state.theta[which]
+    assert residual.across is not None
+    size = len(residual.noise)
+    added = state.adopted[which].terms(state.excitation).at(residual.samples).contribution(theta, size)
+    return residual.across + added / residual.noise @ residual.projector, theta / residual.noise
+
+
+@dataclass(frozen=True)
+class _Test:
+    """The band that speaks most clearly against noise of the groups alone."""
+
+    band: int
+    covariance: Array
+    alone: Factors
+    p: float
+
+
+def _strongest(white: Array, basis: Array, groups: Groups) -> _Test:
+    """The test in the lowest 1/2^k of the cosine coefficients of (N, m), for all k that leave enough of them."""
+    from scipy.fft import dct
+
+    n, m = white.shape
+    coefficients = dct(white, axis=0, norm="ortho")
+    count = int(np.log2((n - 1) / (LEAST_BAND * m)))
+    bands = sorted({LEAST_BAND * m * 2**k for k in range(count + 1)} | {n - 1})
+    tests = []
+    for band in bands:
+        own = coefficients[1 : band + 1]
+        covariance = own.T @ own / band
+        alone = noise_alone(covariance, basis, groups)
+        p = min(1.0, float(np.exp(alone.log_p(_effective(own, covariance)))) * len(bands))
+        tests.append(_Test(band, covariance, alone, p))
+    return max(tests, key=lambda t: t.band * t.alone.deviance)
+
+
+def _effective(coefficients: Array, covariance: Array) -> float:
+    """How many coefficients of one colour tell as much: fewer than (K, m) where the values differ in colour.
+
+    The covariance of two independent series of powers p and q over frequency varies as the mean of p q does.
+    """
+    values, vectors = np.linalg.eigh(covariance)
+    unit = coefficients @ (vectors / np.sqrt(np.maximum(values, 1e-12 * values[-1])))
+    power = np.stack([np.mean(part**2, axis=0) for part in np.array_split(unit, _PARTS)])
+    products = power.T @ power / _PARTS
+    m = len(covariance)
+    alike = (products.sum() - np.trace(products)) / (m * (m - 1))
+    return len(coefficients) / max(alike, 1.0)
+
+
+def lowest(series: Array, band: int) -> Array:
+    """(N, K) without its mean and all cosine coefficients above the lowest ones."""
+    from scipy.fft import dct, idct
+
+    coefficients = dct(series, axis=0, norm="ortho")
+    coefficients[0] = 0.0
+    coefficients[band + 1 :] = 0.0
+    out: Array = idct(coefficients, axis=0, norm="ortho")
+    return out
+
+
+def _outputs(basis: Array) -> Groups:
+    return [np.array([i]) for i in range(len(basis))]
+
+
+def _second(test: _Test, basis: Array, factors: Factors) -> float:
+    """Strength of a second factor beside the first; zero where noise may make it."""
+    alone = test.alone
+    if factors.freedom == 0:  # three sensors: only noise of each output alone leaves anything to disagree
+        alone = noise_alone(test.covariance, basis, _outputs(basis))
+        factors = with_factor(test.covariance, basis, _outputs(basis), alone)
+    if factors.log_p(test.band) > np.log(ALPHA):
+        return 0.0
+    first = alone.deviance - factors.deviance - (alone.freedom - factors.freedom) / test.band
+    second = factors.deviance - factors.freedom / test.band
+    return second / max(first, 1e-300)
+
+
+def _predicted(inside: Array, outside: Array, basis: Array, groups: Groups) -> Gain:
+    """Squares of each sensor's whitened residual as the others predict it, in stretches that the model has not seen.
+
+    Before: the noise of the sensors, with all that it lets them know of each other. After: with the factor. What is
+    outside the band is in both.
+    """
+    n = len(inside)
+    edges = np.linspace(0, n, FOLDS + 1).round().astype(int)
+    sums = np.stack([inside[a:b].T @ inside[a:b] for a, b in itertools.pairwise(edges)])
+    split = [_own_and_others(basis, group) for group in groups]
+    total = sums.sum(axis=0)
+    before, after = np.zeros(FOLDS), np.zeros(FOLDS)
+    for k, (a, b) in enumerate(itertools.pairwise(edges)):
+        train = (total - sums[k]) / (n - (b - a))
+        alone = noise_alone(train, basis, groups)
+        factors = with_factor(train, basis, groups, alone)
+        for own, others in split:
+            rest = float(np.sum((outside[a:b] @ own) ** 2))
+            before[k] += rest + _error(alone.covariance, sums[k], own, others)
+            after[k] += rest + _error(factors.covariance, sums[k], own, others)
+    return Gain(before, after, np.diff(edges) * float(sum(own.shape[1] for own, _ in split)))
+
+
+def _own_and_others(basis: Array, group: NDArray[np.int_]) -> tuple[Array, Array]:
+    """Directions (m, k) that a group of outputs moves, and those (m, m - k) that it does not."""
+    u, s, _ = np.linalg.svd(basis[group].T, full_matrices=True)
+    return u[:, : len(s)], u[:, len(s) :]
+
+
+def _error(model: Array, sums: Array, own: Array, others: Array) -> float:
+    """Sum of squares of `own` less what a model's covariance predicts of it from `others`."""
+    through = np.linalg.solve(others.T @ model @ others, others.T @ model @ own)
+    left = own - others @ through
+    return float(np.sum(left * (sums @ left)))
+
+
+def _turning(record: Record, state: State) -> bool:
+    """Whether the attitude predicts an adopted source in stretches that its coefficients have not seen.
+
+    Beyond the field itself, whose part C has taken. Asked when the source is known, for until then it is in the field
+    too, and what differs between that and a logged attitude follows the source.
+    """
+    found = _put_back(state)
+    assert found is not None
+    across, direction = found
+    series = across @ direction
+    raw, _ = without(record, [a.terms(state.excitation) for a in state.adopted], state.theta)
+    clean = attitude_series(excitation_of(replace(record, raw=raw), state.fit))
+    columns = np.column_stack([state.residual.affine, clean[state.residual.samples]])
+    n = len(series)
+    if n < 4 * columns.shape[1]:
+        return False
+    edges = np.linspace(0, n, FOLDS + 1).round().astype(int)
+    loss = np.zeros((2, FOLDS))
+    for k, (a, b) in enumerate(itertools.pairwise(edges)):
+        train = np.r_[0:a, b:n]
+        for i, some in enumerate((columns[:, :4], columns)):
+            theta = np.linalg.lstsq(some[train], series[train], rcond=1e-9)[0]
+            loss[i, k] = np.sum((series[a:b] - some[a:b] @ theta) ** 2)
+    return Gain(loss[0], loss[1], np.diff(edges).astype(float)).consistent
+
+
+def shared_words(found: Sought, sensors: Sequence[str]) -> str:
+    """A waveform that the sensors share, in words."""
+    strength = np.sqrt(np.sum(found.direction**2, axis=1))
+    each = ", ".join(f"{s} {a:.2g} nT" for s, a in zip(sensors, strength, strict=True))
+    course = "switches between two levels" if found.switches else f"has periods from {found.period_s:.2g} s on"
+    words = f"the sensors share one waveform ({found.share:.0%} of the residual between them; {each}), which {course}"
+    if found.like is not None:
+        name, lag, power, correlation = found.like
+        to_the = "" if power == 1 else f" to the power {power}"
+        return words + (
+            f" and is most like channel {name}{to_the} with a lag of {lag:.3g} s (correlation {correlation:+.2f})"
+        )
+    words += " and follows no logged channel"
+    return words + (f"; not adopted: {found.objection}" if found.objection else "")
+
+
+def followed(time: Array, values: Array, record: Record) -> tuple[str, float, int, float] | None:
+    """The channel, lag, power and correlation that come nearest to a waveform, if they come near."""
+    points = np.linspace(time[0], time[-1], min(COMPARED, len(time)))
+    step = points[1] - points[0]
+    wave = _means(time, values, points)
+    best: tuple[str, float, int, float] | None = None
+    for name, channel in record.logged.items():
+        for column in channel.reshape(len(channel), -1).T:
+            sampled = _means(record.time, column, points)
+            for power in (1, 2, 3):
+                series = sampled**power
+                for shift in range(max(1, int(MOST_LAG * len(points))) + 1):
+                    a, b = wave[shift:], series[: len(series) - shift]
+                    if not a.std() > 0 or not b.std() > 0:
+                        continue
+                    c = float(np.corrcoef(a, b)[0, 1])
+                    if best is None or abs(c) > abs(best[3]) + 0.01:
+                        best = (name, shift * step, power, c)
+    return best if best is not None and abs(best[3]) > LIKE_A_CHANNEL else None
+
+
+def _means(time: Array, values: Array, points: Array) -> Array:
+    """Means of a series about points in time, those between samples from their neighbours."""
+    half = 0.5 * (points[1] - points[0])
+    total = np.concatenate([[0.0], np.cumsum(values)])
+    first, last = np.searchsorted(time, points - half), np.searchsorted(time, points + half)
+    count = last - first
+    mean = (total[last] - total[first]) / np.maximum(count, 1)
+    out: Array = np.where(count > 0, mean, np.interp(points, time, values))
+    return out
