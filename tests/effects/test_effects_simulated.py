@@ -7,6 +7,7 @@ scale effects do not multiply (100 nT in 50 000).
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -240,6 +241,19 @@ def test_channel_response(settings: dict[str, Any], units: str) -> None:
     true = truth_of(survey)
     np.testing.assert_allclose(per_axis(fit, survey.sensors), true, atol=0.02 * np.abs(true).max())
     assert set(magtensor_effects.channel_response(x, channel="pressure", **settings).units) == {units}
+
+
+def test_latent_source() -> None:
+    effect = {"nT_per_unit": drawn(2), "waveform_of": {"type": "switched", "mean_hold_s": 7.0}}
+    survey = simulated("latent_source", **effect)
+    added = survey.truth.effects[0].added
+    u, s, vt = np.linalg.svd(added.reshape(len(added), -1), full_matrices=False)
+    assert s[1] < 1e-9 * s[0]
+    x = replace(excitation(survey), waveform=np.sqrt(len(u)) * u[:, 0])
+    fit = explained(magtensor_effects.latent_source(x), x, added)
+    assert fit.left < 1e-6
+    true = (s[0] / np.sqrt(len(u)) * vt[0]).reshape(-1, 3)
+    np.testing.assert_allclose(per_axis(fit, survey.sensors), true, atol=1e-6 * np.abs(true).max())
 
 
 def test_a_channel_with_three_components_reaches_every_axis() -> None:

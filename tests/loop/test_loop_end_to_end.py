@@ -120,14 +120,38 @@ def test_two_effects_at_once(tmp_path: Path) -> None:
     assert not found["unexplained"]["present"]
 
 
-def test_a_source_that_nobody_logged_is_unexplained_and_blamed_on_nothing(tmp_path: Path) -> None:
-    found = verdict_of(tmp_path, scenario(5, {"type": "latent_source", "rms_nT": 2.0, "waveform_of": SLOW}))
+SWITCHED = {"type": "switched", "levels": [-1.0, 1.0], "mean_hold_s": 70.0}
+
+
+@pytest.mark.parametrize("waveform", [SLOW, SWITCHED])
+def test_a_source_that_nobody_logged_is_found_and_taken_off_another_survey(
+    tmp_path: Path, waveform: dict[str, Any]
+) -> None:
+    vectors = [[0.9, -0.4, 0.6], [-0.5, 0.8, 0.1], [0.2, 0.5, -0.9], [0.7, -0.6, 0.3]]
+    unlogged = {"type": "latent_source", "nT_per_unit": vectors, "waveform_of": waveform}
+    told = {"type": "channel_response", "channel": "hidden", "reference": 0.0, "nT_per_unit": vectors}
+    recipe = yaml.safe_load(RECIPE.read_text())
+    declared = {"channel_response": {"channel": "hidden"}}
+    recipe["stages"][recipe["stages"].index("close_loop")] = {"close_loop": {"declared": declared, "search": []}}
+    edited = tmp_path / "told.yaml"
+    edited.write_text(yaml.safe_dump(recipe))
+    outcome: dict[str, Verdict] = {}
+    for name, effect, path in (("found", unlogged, RECIPE), ("told", told, edited)):
+        surveys = [scenario(seed, effect) for seed in (8, 9)]
+        if name == "told":
+            surveys = [s | {"channels": s["channels"] | {"hidden": waveform}} for s in surveys]
+        survey, verify = (survey_file(tmp_path, s, f"{name}_{i}.h5") for i, s in enumerate(surveys))
+        run_recipe(path, tmp_path / name, survey=survey, verify=verify)
+        outcome[name] = json.loads((tmp_path / name / "verdict.json").read_text())
+    found = outcome["found"]
     require_contract(found)
-    assert adopted_names(found) <= {"latent_source"}
-    if not found["adopted"]:
-        assert found["unexplained"]["present"]
-        assert "waveform" in found["unexplained"]["description"]
-        assert found["unexplained"]["excess_rms_nT"] == pytest.approx(2.0, rel=0.4)
+    assert adopted_names(found) == {"latent_source"}
+    assert not found["unexplained"]["present"], found["unexplained"]
+    assert found["adopted"][0]["indistinguishable_from"] == []
+    for figure in ("total_field_rms_nT", "tensor_rms_nT_per_m"):
+        before, after = (found["error"]["verify"][k][figure]["all"] for k in ("before", "after"))
+        assert after < 1.1 * outcome["told"]["error"]["verify"]["after"][figure]["all"]
+        assert after < 0.5 * before
 
 
 @pytest.mark.parametrize("array", [ONE_SENSOR, TWO_SENSORS])

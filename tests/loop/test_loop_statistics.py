@@ -16,7 +16,6 @@ from magtensor.loop.model import Record, State, quieted
 from magtensor.loop.screening import ALPHA
 from magtensor.loop.spectrum import spectral_lines
 from magtensor.loop.statistics import Gain, cauchy_combination, family_p, wald_p
-from magtensor.loop.unexplained import common_waveform
 
 WHITE = Colour(None, 1.0)
 
@@ -141,29 +140,3 @@ def test_a_line_is_found_and_noise_has_none() -> None:
 def _of(seed: int) -> tuple:
     state, record = with_line(seed, 0.0)
     return state.residual, record.time
-
-
-def test_a_common_waveform_is_found_and_independent_noise_has_none() -> None:
-    samples = 2400
-    wave = np.sin(np.arange(samples) / 70.0) * np.cos(np.arange(samples) / 411.0)
-    direction = np.random.default_rng(1).standard_normal((4, 3))
-    record = synthetic(2, samples, added=1.5 * wave[:, None, None] * direction)
-    found = common_waveform(linear_state(record), record)
-    assert found is not None and found.p < 0.01
-    assert abs(np.corrcoef(found.values, np.interp(found.time, record.time, wave))[0, 1]) > 0.95
-    contrast = 1.5 * (direction - direction.mean(axis=0)) * wave.std()
-    cosine = np.sum(found.direction * contrast) / np.linalg.norm(found.direction) / np.linalg.norm(contrast)
-    assert abs(cosine) > 0.9
-    ps = []
-    for seed in range(12):
-        rng = np.random.default_rng(seed)
-        clean = synthetic(20 + seed, samples, added=flicker(rng, (samples, 4, 3)))
-        other = common_waveform(linear_state(clean), clean)
-        assert other is not None
-        ps.append(other.p)
-    assert np.sum(np.array(ps) <= 0.02) <= 1 and np.median(ps) > 0.15
-
-
-def test_one_sensor_has_no_waveform_in_common() -> None:
-    record = synthetic(3, 1200, sensors=1)
-    assert common_waveform(linear_state(record), record) is None

@@ -234,7 +234,8 @@ def _round_trip(component: Component, x: Excitation, settings: Mapping[str, Any]
     terms = model.terms(x)
     outputs = 3 * len(x.sensors)
     strength = np.array([np.sqrt(np.mean(terms.contribution(unit, outputs) ** 2)) for unit in np.eye(terms.count)])
-    theta = DISTORTION_NT / strength / np.sqrt(terms.count)
+    unlike = np.sqrt(2.0) * np.cos(2.4 * np.arange(terms.count))  # what all sensors share would be a field
+    theta = DISTORTION_NT / strength / np.sqrt(terms.count) * unlike
     distorted = x.output + terms.contribution(theta, outputs).reshape(x.output.shape)
     offset = (x.output - x.sensed(x.field)).mean(axis=0)
     inverse = np.asarray(np.linalg.inv(x.matrix), dtype=float)

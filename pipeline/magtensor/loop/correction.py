@@ -40,7 +40,7 @@ def corrected_raw(
     if hidden is not None:
         others = [i for i in range(len(adopted)) if i != hidden]
         left = corrected_raw(record, calibration, [adopted[i] for i in others], [theta[i] for i in others])
-        noise = np.asarray(adopted[hidden].settings["noise_nT"])
+        noise = _weights(adopted[hidden], record.raw[0].size)
         waveform = hidden_waveform(left, calibration, record.position, theta[hidden], noise, good)
         record = replace(record, waveform=waveform)
     own = [(a, t) for a, t in zip(adopted, theta, strict=True) if a.component.effect == "instrument"]
@@ -101,7 +101,7 @@ def as_elsewhere(record: Record, calibration: ArrayCalibration, state: State) ->
     each = [state.adopted[i].terms(state.excitation) for i in others]
     raw, _ = without(record, each, [state.theta[i] for i in others])
     good = np.asarray(state.fit.keep)
-    noise = np.asarray(state.adopted[which].settings["noise_nT"])
+    noise = _weights(state.adopted[which], raw[0].size)
     waveform = hidden_waveform(raw, calibration, record.position, state.theta[which], noise, good)
     return replace(record, waveform=waveform)
 
@@ -109,6 +109,12 @@ def as_elsewhere(record: Record, calibration: ArrayCalibration, state: State) ->
 def _hidden(adopted: Sequence[Adopted]) -> int | None:
     """Which of the models is a source that nobody logged."""
     return next((i for i, a in enumerate(adopted) if a.name == NAME), None)
+
+
+def _weights(source: Adopted, outputs: int) -> Array:
+    """(outputs,) nT noise by which the outputs are weighed when its waveform is sought; all alike where not known."""
+    known = np.asarray(source.settings.get("noise_nT", ()), dtype=float)
+    return known if len(known) == outputs else np.ones(outputs)
 
 
 def corrected_reference(record: Record, adopted: Sequence[Adopted], theta: Sequence[Array]) -> Array | None:

@@ -22,9 +22,10 @@ from magtensor.loop.assessment import Assessment, estimated
 from magtensor.loop.colour import colour_of
 from magtensor.loop.direction import attitude_series
 from magtensor.loop.factor import Factors, Groups, noise_alone, with_factor
+from magtensor.loop.log_noise import brought_in
 from magtensor.loop.model import Adopted, Fitting, Record, State, excitation_of, joint_state, without
 from magtensor.loop.residual import Residual
-from magtensor.loop.screening import Candidate
+from magtensor.loop.screening import LOG_MARGIN, Candidate
 from magtensor.loop.statistics import FOLDS, Gain
 from magtensor.loop.terms import joined
 from magtensor.loop.waveform import NAME, Course, course_of, free_directions
@@ -53,6 +54,7 @@ class Sought:
         gain: on held-out stretches, of each sensor's whitened residual predicted from the others.
         like: channel, lag s, power and correlation of the channel it follows; None where it follows none.
         switches: whether it has two levels.
+        of_the_log: whether noise in the logs of adopted channels explains it.
         objection: why it is not adopted; "" where nothing stands against it.
     """
 
@@ -66,12 +68,13 @@ class Sought:
     gain: Gain
     like: tuple[str, float, int, float] | None
     switches: bool
+    of_the_log: bool
     objection: str
 
     @property
     def significant(self) -> bool:
         """Whether it is there."""
-        return self.p < ALPHA
+        return self.p < ALPHA and not self.of_the_log
 
 
 def sought(state: State, record: Record) -> Sought | None:
@@ -122,6 +125,7 @@ def sought(state: State, record: Record) -> Sought | None:
         gain=gain,
         like=like,
         switches=course.switches,
+        of_the_log=gain.total <= LOG_MARGIN * _of_the_logs(state),
         objection=objection,
     )
 
@@ -145,7 +149,7 @@ def tried_source(
     component: the error model.
     alpha: family-wise false-alarm probability.
     """
-    if found.objection or found.p >= min(alpha, ALPHA):
+    if found.objection or not found.significant or found.p >= alpha:
         return found, None
     record = replace(record, waveform=np.interp(record.time, found.time, found.values))
     model = Adopted(component, {})
@@ -247,6 +251,12 @@ def _effective(coefficients: Array, covariance: Array) -> float:
     m = len(covariance)
     alike = (products.sum() - np.trace(products)) / (m * (m - 1))
     return len(coefficients) / max(alike, 1.0)
+
+
+def _of_the_logs(state: State) -> float:
+    """Sum of squares that noise in the logs of all adopted channels brings in: it follows one waveform as well."""
+    channels = {v: v for a in state.adopted for v in a.settings.values() if isinstance(v, str)}
+    return brought_in(state, channels) if channels else 0.0
 
 
 def lowest(series: Array, band: int) -> Array:

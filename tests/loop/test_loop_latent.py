@@ -1,0 +1,222 @@
+"""A source nobody logged: its test, its waveform, and what may not pass for one."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from loop_cases import Array, linear_state, synthetic
+from scipy.stats import kstest
+
+from magtensor.calibration.types import ArrayCalibration
+from magtensor.loop.correction import corrected_raw, hidden_waveform
+from magtensor.loop.factor import noise_alone, with_factor
+from magtensor.loop.latent import ALPHA, sought, tried_source
+from magtensor.loop.model import Adopted, Fitting, Record
+from magtensor.loop.switching import two_levels
+from magtensor.loop.waveform import course_of, free_directions
+from magtensor.registry import Registry
+from magtensor.tensor.geometry import array_design, standard_geometry
+
+MODEL = Registry.load().find("error_model", "latent_source")
+
+
+def plane(rng: np.random.Generator, sensors: int) -> Array:
+    """Directions off the plane of nearly parallel sensors."""
+    return free_directions(np.vstack([np.eye(3) + 0.03 * rng.standard_normal((3, 3)) for _ in range(sensors)]))
+
+
+def own_noise(rng: np.random.Generator, samples: int, sensors: int) -> Array:
+    """Noise of each sensor: its own level, its axes correlated."""
+    mix = [np.eye(3) + 0.5 * rng.standard_normal((3, 3)) for _ in range(sensors)]
+    levels = 10.0 ** rng.uniform(-0.3, 0.3, sensors)
+    each = [v * rng.standard_normal((samples, 3)) @ m for v, m in zip(levels, mix, strict=True)]
+    return np.concatenate(each, axis=1)
+
+
+def by_sensor(sensors: int) -> list[np.ndarray]:
+    return [np.arange(3 * s, 3 * s + 3) for s in range(sensors)]
+
+
+@pytest.mark.parametrize("sensors", [3, 4])
+def test_noise_of_single_sensors_is_no_common_factor(sensors: int) -> None:
+    rng = np.random.default_rng(sensors)
+    p = []
+    for _ in range(60):
+        basis = plane(rng, sensors)
+        z = own_noise(rng, 200, sensors) @ basis
+        p.append(np.exp(noise_alone(z.T @ z / 200, basis, by_sensor(sensors)).log_p(200)))
+    assert kstest(p, "uniform").pvalue > 0.001
+
+
+def test_a_factor_is_told_from_noise_and_its_direction_found() -> None:
+    rng = np.random.default_rng(5)
+    basis = plane(rng, 4)
+    direction = rng.standard_normal(12)
+    wave = rng.standard_normal(300)
+    z = (own_noise(rng, 300, 4) + np.outer(wave, direction)) @ basis
+    covariance = z.T @ z / 300
+    alone = noise_alone(covariance, basis, by_sensor(4))
+    found = with_factor(covariance, basis, by_sensor(4), alone)
+    assert alone.log_p(300) < np.log(1e-6)
+    assert found.log_p(300) > np.log(0.001)
+    a, b = basis.T @ found.direction, basis.T @ direction
+    assert abs(a @ b) / np.linalg.norm(a) / np.linalg.norm(b) > 0.95
+    assert found.deviance < alone.deviance
+
+
+def in_noise(signal: Array, strength: float, seed: int = 3) -> tuple[Array, Array, Array]:
+    """Whitened outputs of four sensors with a source, the plane, and its vector; strength of the part off the plane."""
+    rng = np.random.default_rng(seed)
+    held = np.vstack([np.eye(3)] * 4)
+    direction = rng.standard_normal(12)
+    direction -= held @ np.linalg.lstsq(held, direction, rcond=None)[0]
+    direction *= strength / np.linalg.norm(direction)
+    return np.outer(signal, direction) + rng.standard_normal((len(signal), 12)), held, direction
+
+
+def test_a_fast_source_is_known_as_well_as_one_sample_tells() -> None:
+    signal = np.random.default_rng(1).standard_normal(4000)
+    for strength in (0.5, 1.0, 3.0):
+        y, held, direction = in_noise(signal, strength)
+        course = course_of(y, held, direction)
+        left = 1.0 / (1.0 + strength**2)  # of the Wiener filter for white signal in white noise of 1 / strength^2
+        assert np.mean((course.values - signal) ** 2) == pytest.approx(left, rel=0.1)
+        assert course.std**2 == pytest.approx(left, rel=0.15)
+        assert course.rms == pytest.approx(1.0, abs=0.15)
+
+
+def test_a_slow_source_is_known_better_than_one_sample_tells() -> None:
+    signal = np.sqrt(2.0) * np.sin(np.arange(4000) / 90.0)
+    y, held, direction = in_noise(signal, 1.0)
+    assert np.mean((course_of(y, held, direction).values - signal) ** 2) < 0.05
+
+
+def test_where_there_is_no_source_nothing_is_brought_in() -> None:
+    y, held, direction = in_noise(np.zeros(4000), 1.0)
+    assert np.mean(course_of(y, held, direction).values ** 2) < 0.05
+    hidden = course_of(y, np.column_stack([held, direction]), direction)  # all of it looks like a field
+    assert not hidden.values.any() and hidden.rms == 0
+
+
+def test_a_switch_is_known_exactly_and_a_wave_is_no_switch() -> None:
+    rng = np.random.default_rng(4)
+    state = np.cumsum(rng.uniform(size=3000) < 0.02) % 2.0
+    noise = 0.2 * rng.standard_normal(3000)
+    found = two_levels(state + noise, 0.2, state + noise)
+    assert found is not None
+    assert np.sqrt(np.mean((found[0] - state) ** 2)) < 0.05
+    wave = np.sin(np.arange(3000) / 50.0)
+    assert two_levels(wave + noise, 0.2, wave) is None
+    assert two_levels(noise, 0.2, noise) is None
+
+
+def test_no_gradient_is_taken_for_the_source() -> None:
+    """On another survey the waveform comes from where no field could make it, and nothing else is taken off."""
+    rng = np.random.default_rng(8)
+    n = 500
+    position = standard_geometry("cross", 0.5)
+    forward = np.eye(3) + 0.02 * rng.standard_normal((4, 3, 3))
+    calibration = ArrayCalibration(np.linalg.inv(forward), 100.0 * rng.standard_normal((4, 3)), np.eye(48), "", (), {})
+    field = (rng.standard_normal((n, 8)) @ array_design(position, "gradient").T).reshape(n, 4, 3) * 1000.0
+    true = np.einsum("sij,nsj->nsi", forward, field) + calibration.offset
+    wave = np.sin(np.arange(n) / 9.0)
+    theta = rng.standard_normal(12)
+    raw = true + (wave[:, None] * theta).reshape(n, 4, 3)
+    record = replace(synthetic(1, n), raw=raw, position=position)
+    model = Adopted(MODEL, {"noise_nT": [1.0] * 12})
+    np.testing.assert_allclose(corrected_raw(record, calibration, [model], [theta]), true, atol=1e-6)
+    np.testing.assert_allclose(corrected_raw(record, calibration, [model], [0.0 * theta]), raw)
+    unknown = replace(record, position=None)
+    np.testing.assert_array_equal(corrected_raw(unknown, calibration, [model], [theta]), raw)
+    two = ArrayCalibration(calibration.matrix[:2], calibration.offset[:2], np.eye(24), "", (), {})
+    assert not hidden_waveform(raw[:, :2], two, position[[0, 2]], theta[:6], np.ones(6)).any()
+
+
+N = 1600
+WAVE = np.sin(np.arange(N) / 70.0) * np.cos(np.arange(N) / 411.0)
+VECTORS = np.random.default_rng(1).standard_normal((4, 3))
+
+
+def with_source(sensors: int = 4, size: float = 3.0) -> Record:
+    return synthetic(2, N, sensors, added=size * WAVE[:, None, None] * VECTORS[:sensors])
+
+
+def test_a_source_is_found_with_its_waveform_and_vectors() -> None:
+    record = with_source()
+    state = linear_state(record)
+    found = sought(state, record)
+    assert found is not None and found.significant and not found.objection
+    before, after = found.gain.rms
+    assert after < 1.1 < before
+    final, source = tried_source(MODEL, record, state, found, Fitting(), 0.005)
+    assert source is not None and not final.objection
+    wave = source.record.waveform
+    assert wave is not None
+    assert abs(np.corrcoef(wave, WAVE)[0, 1]) > 0.99
+    theta = source.after.theta[0].reshape(4, 3) * np.sign(wave @ WAVE)
+    # 12 values along the field and 9 across from 1600 samples of unit noise: some 0.06 nT
+    np.testing.assert_allclose(theta, 3.0 * VECTORS * WAVE.std(), atol=0.25)
+    left = sought(source.after, source.record)
+    assert left is not None and not left.significant
+
+
+def slow(rng: np.random.Generator, shape: tuple[int, ...]) -> Array:
+    """White and random-walk noise."""
+    return rng.standard_normal(shape) + 0.05 * np.cumsum(rng.standard_normal(shape), axis=0)
+
+
+@pytest.mark.parametrize("sensors", [2, 3, 4])
+def test_independent_slow_noise_has_no_source(sensors: int) -> None:
+    p = []
+    for seed in range(10):
+        record = synthetic(20 + seed, N, sensors, added=slow(np.random.default_rng(seed), (N, sensors, 3)))
+        found = sought(linear_state(record), record)
+        assert found is not None
+        p.append(found.p)
+    assert min(p) > ALPHA
+    assert np.median(p) > 0.1
+
+
+def objection(record: Record) -> str:
+    """Why the source of a record is not adopted; it has to be significant."""
+    state = linear_state(record)
+    found = sought(state, record)
+    assert found is not None and found.significant
+    final, source = tried_source(MODEL, record, state, found, Fitting(), 0.005)
+    assert (source is None) == bool(final.objection)
+    return final.objection
+
+
+def test_one_sensor_alone_and_two_sensors() -> None:
+    alone = np.zeros((4, 3))
+    alone[1] = 3.0
+    record = synthetic(2, N, added=WAVE[:, None, None] * alone)
+    found = sought(linear_state(record), record)
+    assert found is not None and not found.significant  # any noise of that sensor would look the same
+    assert "two sensors" in objection(with_source(sensors=2))
+    single = synthetic(3, N, sensors=1)
+    assert sought(linear_state(single), single) is None
+
+
+def test_what_follows_a_channel_is_not_blamed_on_a_hidden_source() -> None:
+    record = with_source()
+    logged = {"pump": WAVE + 0.2 * np.random.default_rng(5).standard_normal(N)}
+    known = replace(record, logged=logged, means={"pump": np.zeros(())}, units={"pump": "A"})
+    assert "pump" in objection(known)
+
+
+@pytest.mark.parametrize("rank", [1, 3])
+def test_what_follows_the_attitude_is_no_source(rank: int) -> None:
+    """One quadratic form of the direction times a vector at each sensor, or three of them: no catalogue has that."""
+    clean = synthetic(2, N)
+    u = clean.raw.mean(axis=1) / 50_000.0
+    forms = np.column_stack([u[:, 0] * u[:, 1], u[:, 1] * u[:, 2], u[:, 2] * u[:, 0]])[:, :rank]
+    response = 10.0 * np.random.default_rng(7).standard_normal((rank, 12))
+    words = objection(replace(clean, raw=clean.raw + (forms @ response).reshape(clean.raw.shape)))
+    assert words == (
+        "its waveform follows the direction of the field"
+        if rank == 1
+        else "one waveform does not explain what the sensors share"
+    )
