@@ -24,7 +24,7 @@ PIPELINES = {
         {"calibrate_array": {"method": "li2018"}},
         "assemble_tensor",
     ],
-    "joint": ["load", {"detrend_diurnal": {"uncovered": "mask"}}, "calibrate_array", "assemble_tensor"],
+    "joint": ["load", {"detrend_diurnal": {"uncovered": "mask"}}, "calibrate_joint", "assemble_tensor"],
     "loop": ["load", {"detrend_diurnal": {"uncovered": "mask"}}, "close_loop", "assemble_tensor"],
 }
 

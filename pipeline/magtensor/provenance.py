@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 LIBRARIES = ("numpy", "scipy", "h5py", "h5netcdf", "xarray", "pydantic", "pluggy", "pyyaml")
 GROUP = "provenance"
+HASHED_AT_ONCE = 65536  # rows
 
 
 @dataclass(frozen=True)
@@ -118,16 +119,20 @@ def content_sha256(tree: xr.DataTree) -> str:
             continue
         dataset = node.to_dataset(inherit=False)
         for name in sorted(str(v) for v in dataset.variables):
-            values = np.asarray(dataset[name].values)
-            if values.dtype.kind in "OUST":
-                values = np.asarray([str(v) for v in values.ravel()], dtype="U").reshape(values.shape)
-                content = "\0".join(values.ravel().tolist()).encode()
-            else:
-                if values.dtype.kind == "b":
-                    values = values.astype("int8")
-                content = np.ascontiguousarray(values).tobytes()
-            digest.update(f"{node.path}/{name}:{values.shape}:{values.dtype.kind}".encode())
-            digest.update(content)
+            variable = dataset[name].variable
+            kind = variable.dtype.kind
+            if kind in "OUST":
+                values = np.asarray([str(v) for v in variable.values.ravel()], dtype="U").reshape(variable.shape)
+                digest.update(f"{node.path}/{name}:{values.shape}:{values.dtype.kind}".encode())
+                digest.update("\0".join(values.ravel().tolist()).encode())
+                continue
+            stored = "i" if kind == "b" else kind
+            digest.update(f"{node.path}/{name}:{variable.shape}:{stored}".encode())
+            # piece by piece: the tree may be a file that does not fit into the memory
+            for start in range(0, variable.shape[0], HASHED_AT_ONCE) if variable.shape else (None,):
+                part = variable if start is None else variable[start : start + HASHED_AT_ONCE]
+                values = np.asarray(part.values)
+                digest.update(np.ascontiguousarray(values.astype("int8") if kind == "b" else values).tobytes())
     return digest.hexdigest()
 
 

@@ -98,8 +98,10 @@ def run(plan: Plan, survey: Survey, *, progress: Callable[[str], None] | None = 
     return RunResult(survey, tuple(records))
 
 
-def run_stage(stage: PlannedStage, survey: Survey) -> tuple[Survey, StageRecord]:
-    """Run one stage; as `run`."""
+def run_stage(
+    stage: PlannedStage, survey: Survey, function: Callable[..., Any] | None = None
+) -> tuple[Survey, StageRecord]:
+    """Run one stage, or another function in its place; as `run`."""
     _require(stage, survey)
     declares = stage.declares
     view = Watched(
@@ -108,7 +110,7 @@ def run_stage(stage: PlannedStage, survey: Survey) -> tuple[Survey, StageRecord]
     )  # fmt: skip
     started, begin = datetime.now(UTC).isoformat(timespec="milliseconds"), clock.perf_counter()
     try:
-        given = stage.component.function(view, **stage.options)
+        given = (function or stage.component.function)(view, **stage.options)
         after, wrote = _merge(stage, survey, given)
     except MagtensorError:
         raise

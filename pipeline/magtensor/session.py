@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from magtensor.calibrated import left_open
 from magtensor.errors import DataError, UsageError
 from magtensor.provenance import Provenance
 from magtensor.qc import told
-from magtensor.recipe.plan import Plan, plan, read_plan
+from magtensor.recipe.plan import Plan, PlannedStage, plan, read_plan
 from magtensor.recipe.source import Document
 from magtensor.runner import run
 from magtensor.survey.model import Survey, Variable
@@ -161,14 +162,16 @@ def with_declared_alone(calibrated: Survey) -> Survey:
     return without_variables(calibrated, "calibration/effects").merged(variables)
 
 
-def apply_to(calibration: Survey, path: Path, planned: Plan, *, tolerant: bool = False) -> Survey:
-    """Another survey, loaded as the recipe loads and corrected with a calibration; `tolerant` as in `load_as`."""
+def apply_to(
+    calibration: Survey, path: Path, planned: Plan, *, tolerant: bool = False, rows: slice | None = None
+) -> Survey:
+    """Another survey, loaded as the recipe loads and corrected with a calibration; the options as in `load_as`."""
     from magtensor.calibrated import corrected, require_positions, require_sensors, restored
     from magtensor.loop.stored import cleaned, stored_effects
     from magtensor.tensor.elements import five
     from magtensor.tensors import assembled, refined, refinement_noise, stored_assembly, stored_refinement
 
-    survey = load_as(planned, path, tolerant=tolerant)
+    survey = load_as(planned, path, tolerant=tolerant, rows=rows)
     refinement = stored_refinement(calibration)
     if "calibration/matrix" in calibration:
         require_sensors(survey, result.sensors_of(calibration), str(path))
@@ -192,20 +195,16 @@ def apply_to(calibration: Survey, path: Path, planned: Plan, *, tolerant: bool =
     return survey
 
 
-def load_as(planned: Plan, path: Path, *, tolerant: bool = False) -> Survey:
+def load_as(planned: Plan, path: Path, *, tolerant: bool = False, rows: slice | None = None) -> Survey:
     """Run only the stages of a recipe that read and prepare a survey (before any calibration) on another file.
 
     A stage whose variables this survey lacks is left out; `tolerant` also leaves out one that the data refuse, as
-    long as the survey itself was read (a field needs no base station to be corrected).
+    long as the survey itself was read (a field needs no base station to be corrected). `rows` reads only some samples.
     """
-    stages = []
-    for stage in planned.stages:
-        if any(p.startswith("calibration/") for p in (*stage.declares.gives, *stage.declares.needs)):
-            break
-        stages.append(stage)
+    stages = preparing_stages(planned)
     section = planned.survey_for(path)
-    preparing = replace(planned, stages=tuple(stages), survey=section)
-    survey = empty_survey(preparing)
+    preparing = replace(planned, stages=stages, survey=section)
+    survey = replace(empty_survey(preparing), source=replace(preparing.source(), rows=rows))
     for stage in stages:
         if all(any(_fits(p, need) for p in survey.paths()) for need in stage.declares.needs):
             try:
@@ -216,6 +215,16 @@ def load_as(planned: Plan, path: Path, *, tolerant: bool = False) -> Survey:
     if "b_raw" not in survey:
         raise DataError("the recipe loads no survey before it calibrates", where=planned.file)
     return survey
+
+
+def preparing_stages(planned: Plan) -> tuple[PlannedStage, ...]:
+    """The stages before any calibration."""
+    return tuple(takewhile(lambda stage: not calibrates(stage), planned.stages))
+
+
+def calibrates(stage: PlannedStage) -> bool:
+    """Whether a stage has to do with a calibration, its making or its use."""
+    return any(p.startswith("calibration/") for p in (*stage.declares.gives, *stage.declares.needs))
 
 
 def _fits(path: str, pattern: str) -> bool:

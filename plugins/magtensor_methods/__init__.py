@@ -3,7 +3,6 @@
 from magtensor_methods.chi2017 import chi2017 as chi2017
 from magtensor_methods.chi2017 import procrustes as procrustes
 from magtensor_methods.determined import determined_only as determined_only
-from magtensor_methods.joint import joint as joint
 from magtensor_methods.li2018 import li2018 as li2018
 from magtensor_methods.li2018 import li2018_linear as li2018_linear
 from magtensor_methods.li2018 import li2018_lm as li2018_lm

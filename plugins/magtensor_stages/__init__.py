@@ -4,6 +4,7 @@ from magtensor_stages.array import align as align
 from magtensor_stages.array import assemble_tensor as assemble_tensor
 from magtensor_stages.diurnal import detrend_diurnal as detrend_diurnal
 from magtensor_stages.gradiometer import load_tensor as load_tensor
+from magtensor_stages.joint import calibrate_joint as calibrate_joint
 from magtensor_stages.load import load as load
 from magtensor_stages.loop import close_loop as close_loop
 from magtensor_stages.quality import qc as qc

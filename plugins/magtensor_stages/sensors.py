@@ -12,7 +12,6 @@ import numpy as np
 from magtensor import DataError, MethodChoice, NotEnoughData, stage
 from magtensor.calibrated import contrasts, corrected, stored
 from magtensor.calibration.types import PARAMETERS_PER_SENSOR, ArrayCalibration, SensorCalibration
-from magtensor.survey.flags import flag_ranges
 
 if TYPE_CHECKING:
     from magtensor.survey.model import Survey
@@ -112,12 +111,11 @@ def calibrate_scalar(survey: Survey, *, method: MethodChoice = "chi2017") -> dic
 COMMON = (*FITTED, "calibration/rotation")
 
 
-@stage(needs=("b_raw", "total_field"), gives=COMMON, may_give=("residual/contrast", "good"))
-def calibrate_array(survey: Survey, *, method: MethodChoice = "joint") -> dict[str, Any]:
-    """Calibrate all sensors at once into one common frame.
+@stage(needs=("b_raw", "total_field"), gives=COMMON, may_give=("residual/contrast",))
+def calibrate_array(survey: Survey, *, method: MethodChoice) -> dict[str, Any]:
+    """Calibrate all sensors at once into one common frame, as a published method does; ours is `calibrate_joint`.
 
-    A method is ``f(raw (N, S, 3) nT, total_field (N,) nT, *, options) -> ArrayCalibration``. Samples that the
-    method does not believe are flagged.
+    A method is ``f(raw (N, S, 3) nT, total_field (N,) nT, *, options) -> ArrayCalibration``.
     """
     raw, total_field = survey.values("b_raw"), survey.values("total_field")
     good = survey.good & np.isfinite(total_field) & np.isfinite(raw).all(axis=(1, 2))
@@ -127,14 +125,7 @@ def calibrate_array(survey: Survey, *, method: MethodChoice = "joint") -> dict[s
         )
     with naming(survey):
         calibration = method(raw[good], total_field[good])
-    given = common_frame(survey, calibration, method.__name__)
-    if calibration.kept is not None and not calibration.kept.all():
-        doubted = np.zeros(len(good), dtype=bool)
-        doubted[good] = ~calibration.kept
-        given["good"] = (("time", "sensor"), survey.good_by_sensor & ~doubted[:, None], {"long_name": "may be used"})
-        reason = "no calibration and no noise explain it"
-        given["flags"] = flag_ranges(survey.time, doubted, by="calibrate_array", reason=reason)
-    return given
+    return common_frame(survey, calibration, method.__name__)
 
 
 @stage(

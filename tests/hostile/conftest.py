@@ -24,7 +24,7 @@ STAGES: dict[str, list[Any]] = {
     ],
     "li": ["load", "detrend_diurnal", {"calibrate_array": {"method": "li2018"}}, "assemble_tensor", "qc"],
     "joint": [
-        "load", {"detrend_diurnal": {"uncovered": "mask"}}, {"calibrate_array": {"method": "joint"}},
+        "load", {"detrend_diurnal": {"uncovered": "mask"}}, "calibrate_joint",
         "assemble_tensor", "qc",
     ],
 }  # fmt: skip

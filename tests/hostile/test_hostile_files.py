@@ -179,7 +179,7 @@ def test_a_result_is_no_survey(bench: Any, finished: Path, tmp_path: Path) -> No
 
 def test_the_survey_itself_verifies_nothing(command: Any, sound: Path, tmp_path: Path) -> None:
     recipe = tmp_path / "r.yaml"
-    recipe.write_text("title: t\nstages: [load, detrend_diurnal, calibrate_array]\n")
+    recipe.write_text("title: t\nstages: [load, detrend_diurnal, calibrate_joint]\n")
     told = command("run", recipe, "--input", sound, "--verify", sound, "--output", tmp_path / "out")
     told.refused("this is the survey itself", status=2)
 

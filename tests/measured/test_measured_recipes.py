@@ -38,7 +38,7 @@ def result(name: str, *overrides: str) -> Survey:
 def instead(name: str, stage: str) -> Plan:
     """The recipe with its calibration exchanged for a stage of another recipe's plan."""
     found = planned(name, *QUICK.get(name, ()))
-    other = read_plan(RECIPES / "balloon.yaml" if stage == "calibrate_array" else RECIPES / "loop_balloon.yaml")
+    other = read_plan(RECIPES / "balloon.yaml" if stage == "calibrate_joint" else RECIPES / "loop_balloon.yaml")
     one = next(s for s in other.stages if s.component.name == stage)
     before = [s for s in found.stages if not any(p.startswith("calibration/") for p in s.declares.gives)]
     before = [s for s in before if s.component.name != "qc"]
@@ -74,7 +74,7 @@ def test_two_sensors_of_unequal_noise_are_told_apart() -> None:
 
 
 def test_quadcopter_is_refused_nine_parameters() -> None:
-    for stage in ("calibrate_array", "close_loop"):
+    for stage in ("calibrate_joint", "close_loop"):
         found = instead("quadcopter", stage)
         with pytest.raises(NotEnoughData, match=r"attitudes do not determine.*never came within 45 deg"):
             run(found, empty_survey(found))
@@ -103,7 +103,7 @@ def test_broad_with_optical_attitude() -> None:
 
 
 def test_broad_with_a_magnet_is_refused_a_scalar_calibration() -> None:
-    found = instead("broad", "calibrate_array")
+    found = instead("broad", "calibrate_joint")
     magnet = RECIPES / "../../../shared/data/broad/32_disturbed_attached_magnet_1cm.hdf5"
     found = replace(found, survey=found.survey_for(magnet))
     with pytest.raises(NotEnoughData, match="no ellipsoid comes nearer"):
@@ -121,7 +121,7 @@ def test_observatories(name: str, left: list[float]) -> None:
 
 @pytest.mark.parametrize("name", ["boulder", "conrad"])
 def test_an_instrument_that_stands_still_is_refused_nine_parameters(name: str) -> None:
-    found = instead(name, "calibrate_array")
+    found = instead(name, "calibrate_joint")
     with pytest.raises(NotEnoughData, match="attitudes do not determine"):
         run(found, empty_survey(found))
 

@@ -201,5 +201,4 @@ def calibrated(fit: JointFit) -> ArrayCalibration:
             "noise_nT": float(np.sqrt(np.mean(fit.plane.noise**2))),
             "axes": "; ".join(turned_words(matrix)),
         },
-        fit.keep,
     )

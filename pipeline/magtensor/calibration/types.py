@@ -67,7 +67,6 @@ class ArrayCalibration:
         frame: "sensor <name>", "platform", or "artificial platform" (Li 2018).
         unobservable: words for each direction that the data leave free (the gauge).
         diagnostics: further figures to report.
-        kept: (N,) the samples of the fit that were believed; None where the method judges none.
     """
 
     matrix: Array
@@ -76,7 +75,6 @@ class ArrayCalibration:
     frame: str
     unobservable: tuple[str, ...] = ()
     diagnostics: dict[str, float | str] = field(default_factory=dict)
-    kept: NDArray[np.bool_] | None = None
 
     def apply(self, m: Array) -> Array:
         """Raw output (..., S, 3) nT to calibrated field (..., S, 3) nT in `frame`."""

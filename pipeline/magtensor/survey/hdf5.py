@@ -131,15 +131,16 @@ def _dims(item: h5py.Dataset, is_scale: bool) -> tuple[str, ...] | None:
     return tuple(names)
 
 
-def _loader(path: Path, key: str | bytes, part: str | None = None) -> Callable[[], NDArray[Any]]:
-    def load() -> NDArray[Any]:
+def _loader(path: Path, key: str | bytes, part: str | None = None) -> Callable[..., NDArray[Any]]:
+    def load(rows: slice | None = None) -> NDArray[Any]:
         where = f"{path.name}: {_text(key)}"
         with _opened(path) as file:
             try:
                 item = file[key]
                 if item.dtype.kind == "O" and part is None:
-                    return np.asarray(item.asstr(errors="replace")[()], dtype=str)
-                values = item[()] if part is None else item[()][part]
+                    return np.asarray(item.asstr(errors="replace")[() if rows is None else rows], dtype=str)
+                values = item[() if rows is None else rows]
+                values = values if part is None else values[part]
                 attributes = plain_attributes(item.attrs)
             except MemoryError as error:
                 raise DataError("its values do not fit into the memory", where=where) from error

@@ -26,11 +26,13 @@ class Source:
         section: the recipe's `survey` section.
         base: what relative file names are relative to.
         readers: reader components by name.
+        rows: read only these samples; all when None. The survey must be one HDF5 file in the canonical layout.
     """
 
     section: SurveySection
     base: Path
     readers: Mapping[str, Component]
+    rows: slice | None = None
     _tables: dict[Any, Tables] = field(default_factory=dict, repr=False, compare=False)
 
     def sections(self) -> list[tuple[str, FileSection]]:
@@ -113,6 +115,19 @@ class Source:
             self._tables[key] = component.function(paths, **values)
         return self._tables[key]
 
+    def shape(self) -> tuple[int, int]:
+        """Samples and sensors of a survey that can be read in windows.
+
+        Raises:
+            UsageError: it cannot.
+        """
+        if self.section.sensors is not None or self.section.reader is not None or len(self.paths(self.section)) > 1:
+            raise UsageError(
+                "only a survey in one HDF5 file of the canonical layout can be read in windows; leave --memory away"
+            )
+        samples, sensors, *_ = read_hdf5(self.paths(self.section)).find("b_raw").shape
+        return samples, sensors
+
     def read(self) -> Survey:
         """Read the survey: the canonical layout, or through the section's mapping.
 
@@ -137,7 +152,8 @@ class Source:
                         f"{len(paths)} files, but a canonical survey is one file",
                         hint="a mapping with `sensors` can join files that follow each other",
                     )
-                survey = survey_from(read_hdf5(paths))
+                tables = read_hdf5(paths)
+                survey = survey_from(tables if self.rows is None else tables.window(self.rows))
             else:
                 survey = survey_from(self.tables(self.section))
             if self.section.reference is None:

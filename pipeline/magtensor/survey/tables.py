@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ class Column:
         name: the column's name, its number as text if it has none, or the dataset's path.
         origin: `file: dataset` or `file: column 3 (name)`, for messages.
         shape: the first dimension counts the rows.
-        load: reads the values; may raise DataError.
+        load: reads the values; may raise DataError. With a slice as its argument, only those rows (HDF5 only).
         units: as the file states them, None if it does not.
         dims: names of the dimensions if the file states them.
         attributes: what else the file says of it.
@@ -31,7 +32,7 @@ class Column:
     name: str
     origin: str
     shape: tuple[int, ...]
-    load: Callable[[], NDArray[Any]] = field(repr=False, compare=False)
+    load: Callable[..., NDArray[Any]] = field(repr=False, compare=False)
     units: str | None = None
     dims: tuple[str, ...] | None = None
     attributes: Mapping[str, Any] = field(default_factory=dict)
@@ -68,6 +69,18 @@ class Tables:
     attributes: Mapping[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     part_rows: tuple[int, ...] = ()
+
+    def window(self, rows: slice) -> Tables:
+        """The same with some rows only of everything that has as many as `time`, the reference left whole."""
+        count = self.find("time").shape[0]
+        start, stop, _ = rows.indices(count)
+        columns = {
+            name: replace(c, shape=(stop - start, *c.shape[1:]), load=partial(c.load, slice(start, stop)))
+            if c.shape[:1] == (count,) and "/" not in name
+            else c
+            for name, c in self.columns.items()
+        }
+        return replace(self, columns=columns)
 
     @property
     def where(self) -> str:
