@@ -15,6 +15,10 @@ from magtensor.errors import MagtensorError
 
 FILE = click.Path(path_type=Path, dir_okay=False)
 FOLDER = click.Path(path_type=Path, file_okay=False)
+memory_option = click.option(
+    "--memory", "memory_GiB", type=click.FloatRange(min=0, min_open=True), metavar="GIB",
+    help="Work through a survey longer than this in windows.",
+)  # fmt: skip
 plugins_option = click.option(
     "--plugins", "plugin_folders", type=click.Path(path_type=Path), multiple=True, metavar="FOLDER",
     help="A folder of single-file plugins (or one such file); may be given several times.",
@@ -36,6 +40,7 @@ def cli() -> None:
 @click.option("--input", "survey", type=FILE, help="The survey, in place of the recipe's own.")
 @click.option("--verify", type=FILE, help="A second survey in a uniform field; its error goes into the verdict.")
 @click.option("--output", type=FOLDER, help="Folder for the results; default: the recipe's name with .result.")
+@memory_option
 @set_option
 @plugins_option
 def run(
@@ -43,6 +48,7 @@ def run(
     survey: Path | None,
     verify: Path | None,
     output: Path | None,
+    memory_GiB: float | None,
     overrides: tuple[str, ...],
     plugin_folders: tuple[Path, ...],
 ) -> None:
@@ -52,7 +58,7 @@ def run(
     directory = output or Path(f"{recipe.stem}.result")
     finished = run_recipe(
         recipe, directory, survey=survey, verify=verify, overrides=overrides, plugin_folders=plugin_folders,
-        progress=_progress(),
+        progress=_progress(), memory_GiB=memory_GiB,
     )  # fmt: skip
     _progress_end()
     for note in finished.notes:
@@ -69,11 +75,12 @@ def run(
 @click.argument("calibration", type=FILE)
 @click.argument("survey", type=FILE)
 @click.option("--output", type=FILE, help="Default: the survey's name with .calibrated.nc.")
-def apply(calibration: Path, survey: Path, output: Path | None) -> None:
+@memory_option
+def apply(calibration: Path, survey: Path, output: Path | None, memory_GiB: float | None) -> None:
     """Apply a stored CALIBRATION to another SURVEY."""
     from magtensor import session
 
-    applied = session.apply(calibration, survey, output)
+    applied = session.apply(calibration, survey, output, memory_GiB=memory_GiB)
     click.echo(f"calibrated: {applied.file}")
     click.echo(applied.sentence)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -34,12 +35,17 @@ def write(directory: Path, survey: Survey, made_by: Provenance, outcome: dict[st
     tree = result_tree(survey)
     made_by = replace(made_by, content_sha256=provenance.content_sha256(tree))
     with atomic_set(directory, last=RESULT) as folder:
-        _save(tree, made_by, folder / RESULT)
+        save(tree, made_by, folder / RESULT)
         if "calibration" in tree.children:
-            _save(_only(tree, "calibration"), made_by, folder / CALIBRATION)
-        (folder / VERDICT).write_text(json.dumps(finite(outcome), indent=2, allow_nan=False) + "\n", encoding="utf-8")
-        _report(folder)
+            save(only(tree, "calibration"), made_by, folder / CALIBRATION)
+        write_verdict(folder, outcome)
+        report(folder)
     return made_by
+
+
+def write_verdict(folder: Path, outcome: dict[str, Any]) -> None:
+    """`verdict.json` in a folder."""
+    (folder / VERDICT).write_text(json.dumps(finite(outcome), indent=2, allow_nan=False) + "\n", encoding="utf-8")
 
 
 def finite(value: Any) -> Any:
@@ -53,10 +59,10 @@ def finite(value: Any) -> Any:
 
 def write_calibrated(path: Path, survey: Survey, made_by: Provenance) -> None:
     """Write the file of `magtensor apply`."""
-    tree = result_tree(survey)
+    tree = only(result_tree(survey), "calibrated", "qc")
     made_by = replace(made_by, content_sha256=provenance.content_sha256(tree))
     with atomic_path(path) as temporary:
-        _save(_only(tree, "calibrated", "qc"), made_by, temporary)
+        save(tree, made_by, temporary)
 
 
 def result_tree(survey: Survey) -> xr.DataTree:
@@ -84,7 +90,8 @@ def _clean(dataset: xr.Dataset) -> xr.Dataset:
     return dataset
 
 
-def _only(tree: xr.DataTree, *names: str) -> xr.DataTree:
+def only(tree: xr.DataTree, *names: str) -> xr.DataTree:
+    """Some of the groups."""
     import xarray as xr
 
     part = xr.DataTree.from_dict({f"/{n}": tree[n].to_dataset() for n in names if n in tree.children})
@@ -92,15 +99,19 @@ def _only(tree: xr.DataTree, *names: str) -> xr.DataTree:
     return part
 
 
-def _save(tree: xr.DataTree, made_by: Provenance, path: Path) -> None:
+def save(
+    tree: xr.DataTree, made_by: Provenance, path: Path, growing: Mapping[str, tuple[str, ...]] | None = None
+) -> None:
+    """Write the groups with their provenance; `growing` names, for each group, the dimensions that will grow."""
     import xarray as xr
 
     whole = tree.copy()
     whole[provenance.GROUP] = xr.DataTree(xr.Dataset(attrs=made_by.attributes()))
-    whole.to_netcdf(path, engine="h5netcdf")
+    whole.to_netcdf(path, engine="h5netcdf", unlimited_dims=growing)
 
 
-def _report(folder: Path) -> None:
+def report(folder: Path) -> None:
+    """`report.html` of the files in a folder."""
     from magtensor.report import write_report
 
     write_report(folder)

@@ -61,6 +61,7 @@ def run_recipe(
     overrides: Sequence[str] = (),
     plugin_folders: Sequence[Path] = (),
     progress: Callable[[str], None] | None = None,
+    memory_GiB: float | None = None,
 ) -> Finished:
     """Run a recipe, or a result again from its own provenance, and write the files of the contract.
 
@@ -72,6 +73,7 @@ def run_recipe(
         overrides: `PATH=VALUE` texts.
         plugin_folders: folders of single-file plugins.
         progress: called with each stage's name.
+        memory_GiB: work in windows that take about so much memory; the whole survey at once when None.
 
     Raises:
         UsageError, DataError: with the exit status of the contract.
@@ -82,16 +84,22 @@ def run_recipe(
         if survey is None:
             provenance.check_inputs(before)
         planned = again(recipe, before, overrides=overrides, plugin_folders=plugin_folders, survey=survey)
+        memory_GiB = memory_GiB or float(before.notes.get("memory_GiB", 0)) or None
     else:
         planned = read_plan(recipe, overrides=overrides, plugin_folders=plugin_folders, survey=survey)
-    finished = run_plan(planned, output, verify=verify, progress=progress)
+    finished = run_plan(planned, output, verify=verify, progress=progress, memory_GiB=memory_GiB)
     if before is not None and not overrides and survey is None:
         return replace(finished, notes=(*compare(before, finished.made_by), *finished.notes))
     return finished
 
 
 def run_plan(
-    planned: Plan, output: Path, *, verify: Path | None = None, progress: Callable[[str], None] | None = None
+    planned: Plan,
+    output: Path,
+    *,
+    verify: Path | None = None,
+    progress: Callable[[str], None] | None = None,
+    memory_GiB: float | None = None,
 ) -> Finished:
     """Run a plan and write the files of the contract; as `run_recipe`."""
     require_writable(output)
@@ -102,6 +110,10 @@ def run_plan(
         raise UsageError(f"{verify}: this is the survey itself; a verification survey is one that the fit has not seen")
     if progress is not None:
         progress("start")
+    if memory_GiB is not None:
+        from magtensor.long_survey import run_long
+
+        return run_long(planned, output, memory_GiB, verify=verify, progress=progress)
     done = run(planned, empty_survey(planned), progress=progress)
     made_by = provenance.collect(planned, done.records, source.files())
     outcome = verdict(done.survey, verify=verification(done.survey, verify, planned) if verify else None)
@@ -241,13 +253,16 @@ class Applied:
     sentence: str
 
 
-def apply(calibration: Path, survey: Path, output: Path | None = None) -> Applied:
+def apply(
+    calibration: Path, survey: Path, output: Path | None = None, *, memory_GiB: float | None = None
+) -> Applied:
     """Apply a stored calibration to another survey and write its `/calibrated` group.
 
     Args:
         calibration: `calibration.nc` or `result.nc`.
         survey: another survey of the same sensors, in the layout the recipe of the calibration reads.
         output: default: the survey's name with `.calibrated.nc`, beside it.
+        memory_GiB: work in windows that take about so much memory; the whole survey at once when None.
     """
     target = output or survey.with_name(f"{survey.stem}.calibrated.nc")
     refuse_overwriting([target], [survey, calibration])
@@ -255,19 +270,22 @@ def apply(calibration: Path, survey: Path, output: Path | None = None) -> Applie
     stored = result.open_result(calibration)
     made_by = provenance.read(calibration)
     planned = again(calibration, made_by)
-    found = apply_to(stored, survey, planned, tolerant=True)
     inputs = [provenance.file_facts(survey), provenance.file_facts(calibration)]
     applied = Provenance(
         made_by.recipe, inputs, provenance.versions(), made_by.plugins, made_by.stages,
         notes={**made_by.notes, "applied": "recipe and stages are the calibration's, the inputs are this file's"},
     )  # fmt: skip
+    if memory_GiB is not None:
+        from magtensor.long_survey import apply_long
+
+        return apply_long(stored, planned, survey, target, applied, memory_GiB)
+    found = apply_to(stored, survey, planned, tolerant=True)
     result.write_calibrated(target, found, applied)
-    return Applied(target, fit_in_words(found))
+    return Applied(target, fit_in_words(survey_block(found)))
 
 
-def fit_in_words(applied: Survey) -> str:
-    """How well a calibration fits the survey it was applied to: |b| against the survey's own total field."""
-    block = survey_block(applied)
+def fit_in_words(block: dict[str, Any] | None) -> str:
+    """How well a calibration fits a survey with this error block: |b| against the survey's own total field."""
     figures = (block or {}).get("total_field_rms_nT")
     if not figures or figures["all"] is None:
         return "How well it fits cannot be told: this survey has no total field at its samples."

@@ -135,6 +135,6 @@ def quality() -> dict[str, Any]:
 def save(folder: Path, survey: Survey, outcome: dict[str, Any] | None = None, **changes: Any) -> Path:
     """The files of a finished run without the page; `changes` are to the provenance."""
     folder.mkdir(exist_ok=True)
-    result._save(result.result_tree(survey), provenance(**changes), folder / result.RESULT)
+    result.save(result.result_tree(survey), provenance(**changes), folder / result.RESULT)
     (folder / result.VERDICT).write_text(json.dumps(outcome or verdict(survey)))
     return folder
