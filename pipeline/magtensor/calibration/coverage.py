@@ -37,6 +37,7 @@ import numpy as np
 from magtensor.errors import NotEnoughData
 
 from .covariance import scalar_noise
+from .postures import Further, attitude_design, further_postures, sphere
 from .quadric import NotAnEllipsoid, ellipsoid_of, nearest_quadrics
 from .types import Array
 
@@ -79,6 +80,7 @@ class Coverage:
         empty_cones: the largest cones of directions without a sample, largest first.
         unseen: half axes ("+x" ... "-z") that the field never came near.
         still: axes whose output never changed by more than 0.1 % of F.
+        further: the postures that would help most; none where the attitudes are spread well.
     """
 
     samples: int
@@ -92,6 +94,7 @@ class Coverage:
     empty_cones: tuple[Cone, ...]
     unseen: tuple[str, ...]
     still: tuple[str, ...]
+    further: Further
 
     @property
     def faults(self) -> tuple[str, ...]:
@@ -174,17 +177,20 @@ def coverage(
     # from the centre of a surface that lies within a cluster of samples, they seem to lie all round
     directions = _directions(points, centre / field) if believable else _directions(raw, np.zeros(3))
     worst = float("nan")
-    condition = _condition(_attitude_design(directions))
+    attitude = attitude_design(directions)
+    condition = _condition(attitude)
     if matrix is not None:
         b = (raw - centre) @ matrix.T
-        attitude = _attitude_design(b / np.linalg.norm(b, axis=1, keepdims=True))
-        condition = _condition(attitude) if believable else condition
-        scatter = _scatter(attitude, matrix, centre, raw, total_field) * np.sqrt(len(raw) / count)
+        fitted = attitude_design(b / np.linalg.norm(b, axis=1, keepdims=True))
+        if believable:
+            attitude, condition = fitted, _condition(fitted)
+        scatter = _scatter(fitted, matrix, centre, raw, total_field) * np.sqrt(len(raw) / count)
         worst = float(np.hypot(scatter, _bias(matrix, centre / field, nearest.coefficients) * field))
     thinned = directions[_distinct(directions, 0.02)]
+    distinct = len(_distinct(points, SAME_ATTITUDE))
     return Coverage(
         samples=count,
-        distinct=len(_distinct(points, SAME_ATTITUDE)),
+        distinct=distinct,
         condition_number=condition,
         distance=first * field,
         second_distance=second * field,
@@ -194,6 +200,7 @@ def coverage(
         empty_cones=_empty_cones(thinned),
         unseen=_unseen(thinned),
         still=tuple(a for a, spread in zip("xyz", np.ptp(points, axis=0), strict=True) if spread < SAME_ATTITUDE),
+        further=further_postures(attitude.T @ attitude, len(raw), max(len(raw) / distinct, 1.0)),
     )
 
 
@@ -212,10 +219,12 @@ def require_coverage(found: Coverage) -> None:
             hint="look for spikes, stuck or saturated values, the wrong reference, or a moving magnetic object",
         )
     missing = f": {found.missing}" if found.missing else ""
+    help_most = f"; what would help most is {found.further}" if str(found.further) else ""
     raise NotEnoughData(
         f"the attitudes do not determine scale factors, angles and offsets: {'; '.join(found.faults)}; "
         f"condition number {found.condition_number:.2g}{missing}",
-        hint="turn the sensor so that the field passes through these directions too, about more than one axis",
+        hint="turn the sensor so that the field passes through these directions too, about more than one axis"
+        f"{help_most}",
     )
 
 
@@ -226,12 +235,6 @@ def _required_ratio(samples: int) -> float:
         return float("inf")
     w = FALSE_ALARM ** (1.0 / (freedom - 1))
     return max(LEAST_RATIO, float((1 + np.sqrt(1 - w**2)) / w))
-
-
-def _attitude_design(unit: Array) -> Array:
-    """Derivatives (N, 9) of |b|/F with respect to a symmetric change of the matrix and a shift, for directions."""
-    x, y, z = unit.T
-    return np.column_stack([x * x, y * y, z * z, 2 * y * z, 2 * x * z, 2 * x * y, x, y, z])
 
 
 def _condition(attitude: Array) -> float:
@@ -251,8 +254,8 @@ def _scatter(attitude: Array, matrix: Array, offset: Array, raw: Array, total_fi
     bound = noise * np.sqrt(freedom / chdtri(freedom, 0.95))
     b = (raw - offset) @ matrix.T
     gain = np.mean(np.sum(((b / np.linalg.norm(b, axis=1, keepdims=True)) @ matrix) ** 2, axis=1))
-    sphere = _attitude_design(_sphere()) @ vectors
-    return float(bound * np.sqrt(gain * np.max(np.sum(sphere**2 / values, axis=1))))
+    everywhere = attitude_design(sphere()) @ vectors
+    return float(bound * np.sqrt(gain * np.max(np.sum(everywhere**2 / values, axis=1))))
 
 
 def _bias(matrix: Array, offset: Array, nearest: Array) -> float:
@@ -261,7 +264,7 @@ def _bias(matrix: Array, offset: Array, nearest: Array) -> float:
         other = ellipsoid_of(nearest)
     except NotAnEllipsoid:
         return float("inf")
-    points = np.linalg.solve(matrix, _sphere().T).T + offset - other.offset
+    points = np.linalg.solve(matrix, sphere().T).T + offset - other.offset
     squared = np.einsum("ni,ij,nj->n", points, other.shape, points)
     return float(np.max(np.abs(np.sqrt(squared) - 1.0)))
 
@@ -280,15 +283,6 @@ def _directions(points: Array, centre: Array) -> Array:
     return np.divide(shifted, length, out=np.zeros_like(shifted), where=length > 0)
 
 
-def _sphere(count: int = 2000) -> Array:
-    """Directions (count, 3) spread evenly over the sphere (golden spiral): gaps below 5 deg."""
-    k = np.arange(count) + 0.5
-    z = 1 - 2 * k / count
-    turn = np.pi * (1 + np.sqrt(5.0)) * k
-    r = np.sqrt(1 - z**2)
-    return np.column_stack([r * np.cos(turn), r * np.sin(turn), z])
-
-
 def _gap_angles(directions: Array, where: Array) -> Array:
     """Angle in deg from each direction of `where` (M, 3) to the nearest sample."""
     from scipy.spatial import cKDTree
@@ -299,7 +293,7 @@ def _gap_angles(directions: Array, where: Array) -> Array:
 
 
 def _empty_cones(directions: Array, most: int = 3) -> tuple[Cone, ...]:
-    grid = _sphere()
+    grid = sphere()
     gap = _gap_angles(directions, grid)
     found: list[Cone] = []
     while len(found) < most and len(grid) and gap.max() > 30.0:

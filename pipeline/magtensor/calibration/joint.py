@@ -23,7 +23,7 @@ from magtensor.errors import DataError, NotEnoughData
 from .agreement import require_agreement
 from .axes import mirrored_words, turned_words
 from .common_field import CommonField
-from .coverage import WORST_ERROR, coverage, require_coverage
+from .coverage import WORST_ERROR, Coverage, coverage, require_coverage
 from .joint_covariance import forward_covariance
 from .joint_together import Together, fit_together, limits_of, unfolded
 from .maximum_likelihood import ScalarFit
@@ -45,6 +45,7 @@ class JointFit:
         forward: (S, 3, 3), C of m = C b + o; offset: (S, 3) nT.
         plane: the common field; scalar: the calibration within its plane.
         keep: (N,) samples that were used.
+        coverage: what their attitudes can determine, judged in the frame of `nearest_frame`.
     """
 
     forward: Array
@@ -52,6 +53,7 @@ class JointFit:
     plane: CommonField
     scalar: ScalarFit
     keep: Mask
+    coverage: Coverage
 
 
 def fit_joint(raw: Array, total_field: Array, **options: Any) -> JointFit:
@@ -143,7 +145,7 @@ def _accepted(
     )
     require_coverage(found)
     _refuse_sensors(forward, offset, raw, total_field)
-    return JointFit(forward, offset, plane, scalar, keep)
+    return JointFit(forward, offset, plane, scalar, keep, found)
 
 
 def _level(part: Together, plane: CommonField, scalar: ScalarFit, keep: Mask) -> float:
@@ -199,6 +201,9 @@ def calibrated(fit: JointFit) -> ArrayCalibration:
             "chi2_total_field": fit.scalar.chi2,
             "chi2_contrasts": fit.plane.chi2,
             "noise_nT": float(np.sqrt(np.mean(fit.plane.noise**2))),
+            "condition_number": fit.coverage.condition_number,
+            "missing_attitudes": fit.coverage.missing,
+            "further_postures": str(fit.coverage.further),
             "axes": "; ".join(turned_words(matrix)),
         },
     )

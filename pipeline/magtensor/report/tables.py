@@ -333,13 +333,17 @@ def attitudes(content: Content) -> Table | None:
         length = np.linalg.norm(known, axis=1)
         known, length = known[length > 0], length[length > 0]
         if len(known) < 10:
-            cells = ["fewer than ten samples", UNKNOWN, UNKNOWN, UNKNOWN]
+            cells = ["fewer than ten samples", *[UNKNOWN] * 4]
         else:
             found = coverage(known, length, matrix=np.eye(3), offset=np.zeros(3))
             unseen = ", ".join(found.unseen) or "none"
             cone = str(found.empty_cones[0]) if found.empty_cones else "none wider than 30 deg"
-            cells = [count(found.distinct), number(found.condition_number, 3), unseen, cone]
-        headings = ("distinct attitudes", "condition number", "half axes never seen", "largest cone without a sample")
+            further = str(found.further) or "none: well spread"
+            cells = [count(found.distinct), number(found.condition_number, 3), unseen, cone, further]
+        headings = (
+            "distinct attitudes", "condition number", "half axes never seen", "largest cone without a sample",
+            "postures that would help most",
+        )  # fmt: skip
         for heading, cell in zip(headings, cells, strict=True):
             rows.setdefault(heading, []).append(cell)
     return Table(content.sensors, [("", [Row(k, "", v) for k, v in rows.items()])])
