@@ -101,7 +101,9 @@ def from_disk(samples: int, sensors: int) -> tuple[Callable[[], Any], Callable[[
     folder = tempfile.TemporaryDirectory()
     path = Path(folder.name) / "long.h5"
     with h5py.File(path, "w") as file:
-        recorded(file.create_dataset("b_raw", (samples, sensors, 3), chunks=(4096, sensors, 3)), samples, sensors)
+        recorded(
+            file.create_dataset("b_raw", (samples, sensors, 3), dtype="f8", chunks=(4096, sensors, 3)), samples, sensors
+        )
 
     class Recording:
         count, usable, held = samples, None, folder

@@ -115,7 +115,7 @@ def bench(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> Callable[..., Outcome]:
     """Run one of the recipes on a survey file, in this process and without the report."""
-    monkeypatch.setattr(result, "_report", lambda folder: None)
+    monkeypatch.setattr(result, "report", lambda folder: None)
 
     def run(recipe: str, survey: Path | Contents, *more: str, survey_section: Any = None, load: Any = None) -> Outcome:
         path = survey if isinstance(survey, Path) else survey.write(tmp_path / "survey.nc")

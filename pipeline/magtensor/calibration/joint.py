@@ -92,30 +92,31 @@ def fit_recording(
     DataError: a mirrored sensor, or one that does not see the field of the others.
     """
     judge = robust and keep is None
-    allowed = np.ones(recording.count, dtype=bool) if keep is None else keep
-    if recording.usable is not None:
-        allowed = allowed & recording.usable
-    among = np.flatnonzero(allowed)
-    samples = len(among) if len(among) <= AT_ONCE else SELECTION
+    given = [mask for mask in (keep, recording.usable) if mask is not None]
+    allowed = np.logical_and.reduce(given) if given else None
+    among = None if allowed is None else np.flatnonzero(allowed)
+    count = recording.count if among is None else len(among)
+    samples = count if count <= AT_ONCE else SELECTION
     while True:
-        chosen = among[even_blocks(len(among), samples)]
+        chosen = even_blocks(count, samples)
+        chosen = chosen if among is None else among[chosen]
         try:
             part = Together(*selected(recording, chosen), np.cumsum(np.diff(chosen, prepend=-1) != 1))
             begun = fit_together(part, noise=noise, reference_noise=reference_noise, judge=judge)
             level = None if complete else _level(part, begun.plane, begun.scalar, begun.keep)
-            if len(chosen) == len(among):
+            if len(chosen) == count:
                 used = np.zeros(recording.count, dtype=bool)
                 used[chosen] = begun.keep
                 raw, total_field = part.raw[begun.keep], part.total_field[begun.keep]
                 return _accepted(begun.plane, begun.scalar, used, raw, total_field, worst_error, level)
-            limits = limits_of(begun, part, reference_noise, len(among)) if judge else None
+            limits = limits_of(begun, part, reference_noise, count) if judge else None
             whole = fit_whole(
                 recording, begun.plane, begun.scalar, limits=limits, reference_noise=reference_noise, keep=allowed
             )
             return _accepted(whole.plane, whole.scalar, whole.keep, whole.raw, whole.total_field, worst_error, level)
         except NotEnoughData:
             # what a selection lacks, the rest may hold
-            if len(chosen) == len(among) or samples >= LARGEST_SELECTION:
+            if len(chosen) == count or samples >= LARGEST_SELECTION:
                 raise
             samples *= 8
 

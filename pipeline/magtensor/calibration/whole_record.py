@@ -22,7 +22,7 @@ from .recording import Recording, even_samples, pieces
 from .types import Array, Mask
 
 NEGLIGIBLE = 0.01  # of a standard deviation
-PICKED = 8_192  # samples kept from the whole recording to judge its attitudes by
+PICKED = 4_096  # samples kept from the whole recording to judge its attitudes by
 _MOST_READINGS = 8
 
 
@@ -130,7 +130,7 @@ def _read(
 
 
 def _believed(seen: Along, z: Array, limits: Limits) -> Mask:
-    good: Mask = seen.residual**2 <= limits.along
+    good: Mask = np.abs(seen.residual) <= np.sqrt(limits.along)
     if len(z) > 3:
         good &= np.einsum("in,in->n", z[3:], z[3:]) <= limits.across
     return good
