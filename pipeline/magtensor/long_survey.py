@@ -233,8 +233,8 @@ def _prepared(
         times.append(found.time)
         done += len(raw)
     array = xr.concat(chosen, dim="time", data_vars="minimal", coords="minimal", compat="override", join="override")
-    note = f"longer than the memory: {sum(len(i) for i in index)} of its {done} samples stand for it here"
-    attributes["notes"] = [*attributes.get("notes", ()), note]
+    shown = sum(len(i) for i in index)
+    attributes["shown"] = f"{shown} samples, spread evenly over the {done} of the survey"
     tree = xr.DataTree.from_dict({"/array": array, **({"/reference": reference} if reference is not None else {})})
     selection = Survey(tree, tuple(flags), attributes)
     spool = Spool(file, done, array.sizes["sensor"], np.concatenate(usable))

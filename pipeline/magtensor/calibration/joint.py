@@ -118,7 +118,7 @@ def fit_recording(
             # what a selection lacks, the rest may hold
             if len(chosen) == count or samples >= LARGEST_SELECTION:
                 raise
-            samples *= 8
+            samples = min(8 * samples, LARGEST_SELECTION)
 
 
 def _accepted(

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 PAGE = "report.html"
 UNTITLED = "Calibration of a magnetometer array"
-ATTRIBUTES = ("title", "instrument", "platform", "site", "operator")  # of the survey, where it has them
+ATTRIBUTES = ("title", "instrument", "platform", "site", "operator", "shown")  # of the survey, where it has them
 MISSING = "the report needs matplotlib and jinja2: pip install 'magtensor[report]'"
 
 
