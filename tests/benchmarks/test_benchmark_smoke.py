@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -14,3 +15,18 @@ def test_the_quick_benchmark_prints_every_pipeline() -> None:
     assert done.returncode == 0, done.stderr
     rows = [line.split("|")[2].strip() for line in done.stdout.splitlines()[2:]]
     assert rows == ["Chi 2017", "Li 2018", "joint", "loop"]
+
+
+def test_the_joint_benchmark_measures_and_says_what_it_left_out() -> None:
+    script = SCRIPT.with_name("joint.py")
+    for name in ("magtensor joint", "magtensor joint, from disk"):
+        command = [sys.executable, str(script), "--worker", name, "20000", "1"]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr
+        figures = json.loads(done.stdout)
+        # 3 nT over the square root of so many samples, nine parameters
+        assert 0 < figures["error_nT"] < 5 * 3.0 * 3.0 / 20_000**0.5
+        assert figures["seconds"] > 0 and figures["peak_MB"] > 20
+    code = "import joint, sys; print(joint.measured(joint.PEER, 1000, 1, '/bin/false'))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=script.parent)
+    assert done.stdout.strip() == "no reason given"
