@@ -129,7 +129,7 @@ def test_an_array_of_sensors_is_refined_with_the_noise_of_its_sensors(tmp_path: 
     made = simulate(scene)
     write(replace(made, position=made.position * [1.3, 1.0, 1.0]), tmp_path / "s.h5")  # one arm is not what it is said
     recipe = tmp_path / "r.yaml"
-    stages = ["load", "detrend_diurnal", "calibrate_array: {robust: false}", "assemble_tensor"]
+    stages = ["load", "detrend_diurnal", "calibrate_joint: {robust: false}", "assemble_tensor"]
     refine = "refine_invariants: {method: orbit_likelihood}"
     errors = []
     for last in ([], [refine]):
