@@ -76,12 +76,29 @@ def run(
 @click.argument("survey", type=FILE)
 @click.option("--output", type=FILE, help="Default: the survey's name with .calibrated.nc.")
 @memory_option
-def apply(calibration: Path, survey: Path, output: Path | None, memory_GiB: float | None) -> None:
+@click.option(
+    "--refine-rotation", is_flag=True,
+    help="Turn the common frame until the tensor of this survey is symmetric, if its gradients tell that well enough.",
+)  # fmt: skip
+@click.option("--save-calibration", type=FILE, help="Write the calibration as it was applied, for further surveys.")
+def apply(
+    calibration: Path,
+    survey: Path,
+    output: Path | None,
+    memory_GiB: float | None,
+    refine_rotation: bool,
+    save_calibration: Path | None,
+) -> None:
     """Apply a stored CALIBRATION to another SURVEY."""
     from magtensor import session
 
-    applied = session.apply(calibration, survey, output, memory_GiB=memory_GiB)
+    applied = session.apply(
+        calibration, survey, output, memory_GiB=memory_GiB, refine_rotation=refine_rotation,
+        save_calibration=save_calibration,
+    )  # fmt: skip
     click.echo(f"calibrated: {applied.file}")
+    if applied.refined:
+        click.echo(f"common rotation: {applied.refined}.")
     click.echo(applied.sentence)
 
 

@@ -65,6 +65,18 @@ def write_calibrated(path: Path, survey: Survey, made_by: Provenance) -> None:
         save(tree, made_by, temporary)
 
 
+def write_calibration(path: Path, calibration: Survey, made_by: Provenance) -> None:
+    """Write a calibration alone, as it was read or turned since."""
+    import xarray as xr
+
+    node = _clean(calibration.tree["calibration"].to_dataset())
+    tree = xr.DataTree.from_dict({"/calibration": node})
+    tree.attrs = plain_attributes({str(k): v for k, v in calibration.tree.attrs.items() if k != "source"})
+    made_by = replace(made_by, content_sha256=provenance.content_sha256(tree))
+    with atomic_path(path) as temporary:
+        save(tree, made_by, temporary)
+
+
 def result_tree(survey: Survey) -> xr.DataTree:
     """The groups of the contract, ready to be written."""
     import xarray as xr

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import takewhile
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from magtensor import provenance, result
 from magtensor.accuracy import figure
@@ -20,6 +20,9 @@ from magtensor.recipe.source import Document
 from magtensor.runner import run
 from magtensor.survey.model import Survey, Variable
 from magtensor.verdict import sentence, survey_block, verdict
+
+if TYPE_CHECKING:
+    from magtensor.platform_frame import Tied
 
 HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
 
@@ -178,24 +181,53 @@ def apply_to(
     calibration: Survey, path: Path, planned: Plan, *, tolerant: bool = False, rows: slice | None = None
 ) -> Survey:
     """Another survey, loaded as the recipe loads and corrected with a calibration; the options as in `load_as`."""
+    return apply_and_refine(calibration, path, planned, tolerant=tolerant, rows=rows, refine_rotation=False)[0]
+
+
+def apply_and_refine(
+    calibration: Survey,
+    path: Path,
+    planned: Plan,
+    *,
+    tolerant: bool,
+    refine_rotation: bool,
+    rows: slice | None = None,
+) -> tuple[Survey, Tied | None]:
+    """As `apply_to`; with `refine_rotation` turned into the frame in which the survey's own tensor is symmetric.
+
+    Returns:
+        The survey, and the calibration in its new frame: None where no turn was asked for or is significant. The
+        attribute `rotation_refined` of `calibrated/b` says what was done.
+    """
     from magtensor.calibrated import corrected, require_positions, require_sensors, restored
     from magtensor.loop.stored import cleaned, stored_effects
+    from magtensor.platform_frame import as_fitted, with_refined_rotation
     from magtensor.tensor.elements import five
     from magtensor.tensors import assembled, refined, refinement_noise, stored_assembly, stored_refinement
 
+    turned: Tied | None = None
     survey = load_as(planned, path, tolerant=tolerant, rows=rows)
     refinement = stored_refinement(calibration)
     if "calibration/matrix" in calibration:
         require_sensors(survey, result.sensors_of(calibration), str(path))
-        fitted = restored(calibration)
-        survey = cleaned(survey, fitted, *stored_effects(calibration, planned.registry))
-        survey = survey.merged(corrected(fitted, survey))
-        if "calibration/tensor_gain" in calibration:
+        if "calibration/position" in calibration:
             require_positions(survey, calibration.values("calibration/position"), str(path))
+        fitted = restored(calibration)
+        survey = cleaned(survey, as_fitted(calibration, fitted), *stored_effects(calibration, planned.registry))
+        survey = survey.merged(corrected(fitted, survey))
+        if refine_rotation:
+            survey, turned = with_refined_rotation(survey, calibration, fitted)
+            fitted = turned.calibration if turned is not None else fitted
+        if "calibration/tensor_gain" in calibration:
             b, noise = survey.values("calibrated/b"), calibration.values("calibration/noise_std")
             position = calibration.values("calibration/position")
             assembly = stored_assembly(calibration)
             survey = survey.merged(assembled(assembly, b, position, noise, fitted, refinement))
+    elif refine_rotation:
+        raise DataError(
+            "it calibrates no sensors, so there is no common frame to refine",
+            where=str(calibration.attributes.get("source", "")),
+        )
     elif refinement is not None:
         measured = five(survey.values("calibrated/tensor"))
         survey = survey.merged(refined(measured, refinement_noise(calibration), refinement))
@@ -204,7 +236,7 @@ def apply_to(
             "it holds no calibration", where=str(calibration.attributes.get("source", "")),
             hint="name a calibration.nc or result.nc",
         )  # fmt: skip
-    return survey
+    return survey, turned
 
 
 def load_as(planned: Plan, path: Path, *, tolerant: bool = False, rows: slice | None = None) -> Survey:
@@ -247,14 +279,24 @@ def _fits(path: str, pattern: str) -> bool:
 
 @dataclass(frozen=True)
 class Applied:
-    """A calibrated survey that was written: its file, and how well the calibration fits it, in words."""
+    """A calibrated survey that was written: its file, and in words how well the calibration fits it.
+
+    `refined` says what the survey's gradients made of the calibration's frame; empty where that was not asked for.
+    """
 
     file: Path
     sentence: str
+    refined: str = ""
 
 
 def apply(
-    calibration: Path, survey: Path, output: Path | None = None, *, memory_GiB: float | None = None
+    calibration: Path,
+    survey: Path,
+    output: Path | None = None,
+    *,
+    memory_GiB: float | None = None,
+    refine_rotation: bool = False,
+    save_calibration: Path | None = None,
 ) -> Applied:
     """Apply a stored calibration to another survey and write its `/calibrated` group.
 
@@ -263,10 +305,18 @@ def apply(
         survey: another survey of the same sensors, in the layout the recipe of the calibration reads.
         output: default: the survey's name with `.calibrated.nc`, beside it.
         memory_GiB: work in windows that take about so much memory; the whole survey at once when None.
+        refine_rotation: turn the calibration's frame until the survey's tensor is symmetric, if that is significant.
+        save_calibration: a file to write the calibration to as it was applied.
     """
     target = output or survey.with_name(f"{survey.stem}.calibrated.nc")
-    refuse_overwriting([target], [survey, calibration])
-    require_writable(target.parent)
+    written = [target, *([save_calibration] if save_calibration else [])]
+    refuse_overwriting(written, [survey, calibration])
+    for file in written:
+        require_writable(file.parent)
+    if memory_GiB is not None and (refine_rotation or save_calibration is not None):
+        raise UsageError("the common rotation is refined on the whole survey: leave --memory out")
+    from magtensor.platform_frame import calibration_variables
+
     stored = result.open_result(calibration)
     made_by = provenance.read(calibration)
     planned = again(calibration, made_by)
@@ -279,9 +329,14 @@ def apply(
         from magtensor.long_survey import apply_long
 
         return apply_long(stored, planned, survey, target, applied, memory_GiB)
-    found = apply_to(stored, survey, planned, tolerant=True)
+    found, turned = apply_and_refine(stored, survey, planned, tolerant=True, refine_rotation=refine_rotation)
     result.write_calibrated(target, found, applied)
-    return Applied(target, fit_in_words(survey_block(found)))
+    if save_calibration is not None:
+        if turned is not None:
+            stored = stored.merged(calibration_variables(stored, result.sensors_of(stored), turned))
+        result.write_calibration(save_calibration, stored, applied)
+    words = str(found["calibrated/b"].attrs["rotation_refined"]) if refine_rotation else ""
+    return Applied(target, fit_in_words(survey_block(found)), words)
 
 
 def fit_in_words(block: dict[str, Any] | None) -> str:
