@@ -2,6 +2,7 @@
 
 from magtensor_metrics.disturbance import noise_level, outliers
 from magtensor_metrics.fit import closure, contrast, flagged, total_field
+from magtensor_metrics.frame import common_rotation
 from magtensor_metrics.refinement import refinement
 
-__all__ = ["closure", "contrast", "flagged", "noise_level", "outliers", "refinement", "total_field"]
+__all__ = ["closure", "common_rotation", "contrast", "flagged", "noise_level", "outliers", "refinement", "total_field"]
