@@ -59,8 +59,7 @@ class Platform:
     def calibration(self, samples: int = 600) -> ArrayCalibration:
         """The joint calibration of a survey in all attitudes: its frame is not the platform's."""
         raw, size = self.uniform(Rotation.random(samples, random_state=self.rng).as_matrix()), np.linalg.norm(EARTH)
-        field = np.full(samples, size)
-        return calibrated(fit_joint(raw, field), field, raw)
+        return calibrated(fit_joint(raw, np.full(samples, size)))
 
 
 def _direction(rng: np.random.Generator) -> np.ndarray:
