@@ -188,6 +188,27 @@ def test_mistakes_and_lacks_are_told(files, options, kind, said):
         run_recipe(RECIPE, files / "refused", survey=files / "plain.h5", overrides=overrides)
 
 
+def test_the_closed_loop_uses_an_attitude(files):
+    """The frame is the platform's; the errors of a uniform field, before and after, are those of the untied frame."""
+    from magtensor.session import run_recipe
+
+    recipe = RECIPE.with_name("closed_loop.yaml")
+    found = {
+        name: run_recipe(
+            recipe, files / f"loop_{name}", survey=files / f"{name}.h5", verify=files / f"{other}.h5",
+            overrides=["stages.close_loop.search=[temperature_offset]"],
+        )
+        for name, other in (("attitude", "plain"), ("plain", "attitude"))
+    }  # fmt: skip
+    tied, free = (found[name].survey["calibration/matrix"].attrs["frame"] for name in ("attitude", "plain"))
+    assert tied.startswith("platform (by attitude")
+    assert not free.startswith("platform")
+    for when in ("before", "after"):
+        one, two = (found[name].outcome["error"]["verify"][when] for name in ("attitude", "plain"))
+        for figure in ("total_field_rms_nT", "tensor_rms_nT_per_m"):
+            assert one[figure]["all"] == pytest.approx(two[figure]["all"], rel=0.02)
+
+
 def test_it_comes_before_the_tensor(files, tmp_path):
     from magtensor.session import run_recipe
 
