@@ -51,7 +51,7 @@ def baseline_expansion(x: Excitation, *, channel: Thermometer = "") -> Terms:
     One coefficient. Rival: `position_error` where the temperature hardly changes.
     """
     name = THERMOMETER.pick(x, channel)
-    logged = x.channel(name)
+    logged = x.thermometer(name)
     warmth = logged.mean(axis=1) if logged.ndim == 2 else logged
     shift = np.einsum("nij,sj->nsi", x.gradient, _positions(x))
     return x.shared(x.sensed(1e-6 * warmth[:, None, None] * shift), f"ppm/{x.units[name]}", "expansion")

@@ -35,7 +35,7 @@ def temperature_offset(x: Excitation, *, channel: Thermometer = "", lag_s: Therm
     hardly changes; `temperature_rate` for short lags.
     """
     name = THERMOMETER.pick(x, channel)
-    return x.offsets(x.lagged(x.channel(name), lag_s), f"nT/{x.units[name]}")
+    return x.offsets(x.lagged(x.thermometer(name), lag_s), f"nT/{x.units[name]}")
 
 
 @error_model(
@@ -51,7 +51,7 @@ def temperature_scale(x: Excitation, *, channel: Thermometer = "", lag_s: Therma
     the attitude hardly changes; `scale_drift` where the temperature rises steadily.
     """
     name = THERMOMETER.pick(x, channel)
-    return x.scales(1e-6 * x.lagged(x.channel(name), lag_s), f"ppm/{x.units[name]}")
+    return x.scales(1e-6 * x.lagged(x.thermometer(name), lag_s), f"ppm/{x.units[name]}")
 
 
 @error_model(
@@ -77,5 +77,5 @@ def temperature_rate(
     axis. Rival: `temperature_offset` with a lag.
     """
     name = THERMOMETER.pick(x, channel)
-    skin = x.channel(name)
+    skin = x.thermometer(name)
     return x.offsets(skin - x.lagged(skin, tau_s), f"nT/{x.units[name]}")

@@ -12,7 +12,9 @@ from scipy.stats import kstest
 from magtensor.loop.assessment import block_count, colours_of
 from magtensor.loop.colour import Colour, colour_of
 from magtensor.loop.evidence import grams
-from magtensor.loop.model import Record, State, quieted
+from magtensor.loop.model import Record, State
+from magtensor.loop.quiet import quieted
+from magtensor.loop.record import CLEARANCE
 from magtensor.loop.screening import ALPHA
 from magtensor.loop.spectrum import spectral_lines
 from magtensor.loop.statistics import Gain, cauchy_combination, family_p, wald_p
@@ -111,10 +113,10 @@ def test_a_reference_without_its_noise() -> None:
     n = 1000
     field = 50_000.0 + 20.0 * np.sin(np.arange(n) / 100.0) + 0.02 * np.arange(n)
     noisy = field + 0.5 * rng.standard_normal(n)
-    quiet = quieted(noisy)
+    quiet = quieted(noisy, CLEARANCE)
     assert np.std(quiet - field) < 0.35 * 0.5
-    assert np.ptp(quieted(50_000.0 + 0.5 * rng.standard_normal(n))) < 0.5  # ptp of the noise: 3.3
-    np.testing.assert_allclose(quieted(field), field, atol=0.05)
+    assert np.ptp(quieted(50_000.0 + 0.5 * rng.standard_normal(n), CLEARANCE)) < 0.5  # ptp of the noise: 3.3
+    np.testing.assert_allclose(quieted(field, CLEARANCE), field, atol=0.05)
 
 
 def with_line(seed: int, amplitude: float, frequency: float = 0.083) -> tuple[State, Record]:

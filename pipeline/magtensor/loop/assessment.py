@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from magtensor.calibration.types import Array
 from magtensor.loop.colour import Colour, colour_of
-from magtensor.loop.evidence import grams, normal
+from magtensor.loop.evidence import Grams, Whitened, grams, grams_in, normal
 from magtensor.loop.residual import Residual, taken_off
 from magtensor.loop.statistics import Estimate, Gain, family_p, held_out_gain, own_information, solve
 from magtensor.loop.terms import Terms, joined
+from magtensor.loop.turned import TurnedColour, excess_of, excess_of_one
 
 FINEST_BLOCKS = 120
 LEAST_PER_BLOCK = 4
@@ -23,7 +24,10 @@ class Colours:
     """The colours of the two parts of a residual."""
 
     across: Colour
-    along: Colour
+    along: Colour | TurnedColour
+
+
+WHITE = Colours(Colour(None, 1.0), Colour(None, 1.0))
 
 
 def colours_of(residual: Residual, *, stiff: bool = False) -> Colours:
@@ -31,8 +35,22 @@ def colours_of(residual: Residual, *, stiff: bool = False) -> Colours:
     white = Colour(None, 1.0)
     size = len(residual.noise)
     across = colour_of(residual.across, size - 3, stiff=stiff) if residual.across is not None else white
-    along = colour_of(residual.along[:, None], stiff=stiff) if residual.along is not None else white
-    return Colours(across, along)
+    return Colours(across, white if residual.along is None else _along(residual, residual.along, across, stiff))
+
+
+def _along(residual: Residual, along: Array, across: Colour, stiff: bool) -> Colour | TurnedColour:
+    """The colour along the field: the sensors' slow noise turned, as the contrasts show it, and a stationary rest."""
+    plain = colour_of(along[:, None], stiff=stiff)
+    modes = residual.slow_modes
+    if residual.across is None:
+        excess = excess_of_one(modes, along, plain.white) if plain.power is not None or stiff else np.zeros(0)
+        share = 1.0
+    else:
+        excess, share = excess_of(across, modes.most), across.white / plain.white
+    if not len(excess):
+        return plain
+    turned = TurnedColour(modes, np.repeat(excess * share, 3), Colour(None, 1.0))
+    return replace(turned, rest=colour_of(turned.still(along)[:, None], stiff=stiff))
 
 
 @dataclass(frozen=True)
@@ -43,15 +61,19 @@ class Assessment:
         estimate: coefficients, covariance (in noise of the fitted colour), information.
         gain: on held-out blocks, in noise whose colour is found when the terms have explained their part.
         null_gain: the same in noise whose colour is found without them: what the null hypothesis says of the noise.
-        p: that all coefficients are zero, in noise of the null hypothesis' colour.
+        p: that all coefficients are zero, from the scatter over blocks.
+        null_p: the same from what they explain in noise of the colour that the residual has without them.
         colours: under the hypothesis that the terms are real.
+        theta: the likeliest coefficients, with any colour: where a joint fit begins.
     """
 
     estimate: Estimate
     gain: Gain
     null_gain: Gain
     p: float
+    null_p: float
     colours: Colours
+    theta: Array
 
 
 def block_count(samples: int) -> int:
@@ -80,24 +102,77 @@ def assess(residual: Residual, terms: Terms, colours: Colours, given: Terms | No
     count = block_count(len(residual.affine))
     null = grams(residual, together, colours.across, colours.along, count)
     null_gain = held_out_gain(null, residual.freedom, blocked)
-    now = colours
-    for _ in range(_ROUNDS):
-        estimate = estimated(residual, together, now)
-        after = colours_of(taken_off(residual, together, estimate.theta), stiff=True)
-        settled = _alike(after, now)
-        now = after
-        if settled:
-            break
+    null_p = _p_of(null, first)
+    starts = [colours] if _white(colours) else [colours, WHITE]
+    best = max((_likeliest(residual, together, start) for start in starts), key=lambda found: found.log_likelihood)
+    now = best.colours
     blocks = grams(residual, together, now.across, now.along, count)
     n, y = normal(blocks.total())
     estimate = solve(n[0], y[0], own_information(blocks))
     p = family_p(blocks, together.sensors, own)
-    return Assessment(estimate, held_out_gain(blocks, residual.freedom, blocked), null_gain, p, now)
+    gain = held_out_gain(blocks, residual.freedom, blocked)
+    return Assessment(estimate, gain, null_gain, p, null_p, now, best.theta)
+
+
+@dataclass(frozen=True)
+class Likeliest:
+    """Coefficients (P,), the colour of what they leave, and the log likelihood of both."""
+
+    theta: Array
+    colours: Colours
+    log_likelihood: float
+
+
+def _likeliest(residual: Residual, terms: Terms, colours: Colours) -> Likeliest:
+    """The likeliest coefficients and colour, found from a first guess of the colour.
+
+    They depend on each other, and may agree in two ways: the terms explain what is slow, or the noise does and the
+    terms follow its middle frequencies. Where one guess leads is not where another does, a law that fits the spectrum
+    badly may lead away from both, and the likelihood says which to believe.
+    """
+    found: list[Likeliest] = []
+    for _ in range(_ROUNDS):
+        theta = estimated(residual, terms, colours).theta
+        left = taken_off(residual, terms, theta)
+        after = colours_of(left, stiff=True)
+        found.append(Likeliest(theta, after, log_likelihood(left, after)))
+        if _alike(after, colours):
+            break
+        colours = after
+    return max(found, key=lambda each: each.log_likelihood)
+
+
+def _p_of(blocks: Grams, given: int) -> float:
+    """P value of all terms but the first ones, from what they explain in white noise of unit variance."""
+    from scipy.stats import chi2
+
+    n, y = normal(blocks.total())
+    scale = own_information(blocks)
+    every, without = solve(n[0], y[0], scale), solve(n[0, :given, :given], y[0, :given], scale[:given])
+    return float(chi2.sf(explained(every) - explained(without), max(every.rank - without.rank, 1)))
+
+
+def log_likelihood(residual: Residual, colours: Colours) -> float:
+    """Of a residual in noise of given colours, but for a constant."""
+    total, size = 0.0, len(residual.noise)
+    total += 2.0 * len(residual.affine) * residual.freedom * float(np.mean(np.log(residual.noise)))
+    if residual.across is not None:
+        total += (size - 3) * colours.across.log_volume(len(residual.affine))
+        total += float(np.sum(colours.across.whiten(residual.across) ** 2))
+    if residual.along is not None:
+        total += colours.along.log_volume(len(residual.affine))
+        total += float(np.sum(colours.along.whiten(residual.along) ** 2))
+    return -total / 2.0
 
 
 def estimated(residual: Residual, terms: Terms, colours: Colours) -> Estimate:
     """Coefficients in noise of given colours."""
-    whole = grams(residual, terms, colours.across, colours.along)
+    return estimated_in(Whitened.of(residual, colours.across, colours.along), terms)
+
+
+def estimated_in(white: Whitened, terms: Terms) -> Estimate:
+    """The same where several terms are judged in one residual."""
+    whole = grams_in(white, terms)
     n, y = normal(whole)
     return solve(n[0], y[0], own_information(whole))
 
@@ -110,13 +185,13 @@ def explained(estimate: Estimate) -> float:
 
 def _alike(a: Colours, b: Colours) -> bool:
     return all(
-        np.isclose(x.white, y.white, rtol=1e-3) and _lowest(x) < 1.1 * _lowest(y) and _lowest(y) < 1.1 * _lowest(x)
+        np.isclose(x.white, y.white, rtol=1e-3) and 1 / 1.1 < x.lowest / y.lowest < 1.1
         for x, y in ((a.across, b.across), (a.along, b.along))
     )
 
 
-def _lowest(colour: Colour) -> float:
-    return 1.0 if colour.power is None else float(colour.power[0])
+def _white(colours: Colours) -> bool:
+    return colours.across.power is None and isinstance(colours.along, Colour) and colours.along.power is None
 
 
 def contribution_rms(terms: Terms, theta: Array, outputs: int) -> Array:

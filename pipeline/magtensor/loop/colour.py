@@ -16,6 +16,8 @@ import numpy as np
 from magtensor.calibration.types import Array
 
 _COLUMNS = 16  # filtered at a time
+_SHORT = np.array([1.0, 3.0, 10.0])  # time constants in samples
+_LEAST_OF_SHORT = 100  # of them in a survey, or it is not short
 
 
 @dataclass(frozen=True)
@@ -29,6 +31,16 @@ class Colour:
 
     power: Array | None
     white: float
+
+    @property
+    def lowest(self) -> float:
+        """Power at the lowest frequency over the white level."""
+        return 1.0 if self.power is None else float(self.power[0])
+
+    def log_volume(self, count: int) -> float:
+        """The sum of the logarithms of the spectrum, for a series of so many samples."""
+        spread = 0.0 if self.power is None else float(np.sum(np.log(self.power)))
+        return count * float(np.log(self.white)) + spread
 
     def whiten(self, series: Array) -> Array:
         """Filter (N,) or (N, K) so that noise of this colour becomes white with unit variance."""
@@ -53,8 +65,8 @@ def colour_of(series: Array, freedom: float | None = None, *, stiff: bool = Fals
     ----------
     series: residuals.
     freedom: how many independent values a row holds; K if None.
-    stiff: white, 1/f and 1/f^2 only, so that the lowest frequencies follow from the middle ones. What a regressor
-        took away there, having followed the noise, is then not missed.
+    stiff: white, 1/f, 1/f^2 and processes of a few samples only, so that the lowest frequencies follow from the
+        middle ones. What a regressor took away there, having followed the noise, is then not missed.
     """
     from scipy.fft import dct
     from scipy.optimize import nnls
@@ -102,9 +114,14 @@ def _relaxations(frequency: Array, n: int) -> Array:
 
 
 def _laws(frequency: Array, n: int) -> Array:
-    """White noise, 1/f and 1/f^2, (M, 3), each 1 at the survey's own frequency."""
+    """White noise, 1/f and 1/f^2, each 1 at the survey's own frequency, and short first-order processes, (M, 3 + Q).
+
+    A base station that is read more seldom than the sensors leaves noise with a plateau, which the laws alone would
+    take for the beginning of a steep rise.
+    """
     slow = 1.0 / (2.0 * n * frequency)
-    return np.column_stack([np.ones_like(frequency), slow, slow**2])
+    short = _SHORT[n > _LEAST_OF_SHORT * _SHORT]
+    return np.column_stack([np.ones_like(frequency), slow, slow**2, *[_relaxation(frequency, t) for t in short]])
 
 
 def _relaxation(frequency: Array, tau: float) -> Array:

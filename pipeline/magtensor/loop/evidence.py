@@ -18,6 +18,7 @@ from magtensor.calibration.types import Array
 from magtensor.loop.colour import Colour
 from magtensor.loop.residual import Residual
 from magtensor.loop.terms import REFERENCE, Terms
+from magtensor.loop.turned import TurnedColour
 
 IDENTIFIABLE = 1e-6  # of a regressor's own information: less than this is left after the fit's own freedom
 _INNER_RANK = 1e-9
@@ -79,7 +80,36 @@ class Grams:
         )  # fmt: skip
 
 
-def grams(residual: Residual, terms: Terms, across: Colour, along: Colour, blocks: int = 1) -> Grams:
+@dataclass(frozen=True)
+class Whitened:
+    """A residual and the fit's own freedom in noise made white: what does not depend on the terms.
+
+    Attributes:
+        residual: of N samples; across, along: the colours of its two parts.
+        z, e: (N, 4) affine functions and (N, 3 S) the residual across; None for a single sensor.
+        inner, r: (N, 12) and (N,) along; None without a total field.
+    """
+
+    residual: Residual
+    across: Colour
+    along: Colour | TurnedColour
+    z: Array | None
+    e: Array | None
+    inner: Array | None
+    r: Array | None
+
+    @classmethod
+    def of(cls, residual: Residual, across: Colour, along: Colour | TurnedColour) -> Whitened:
+        z = e = inner = r = None
+        if residual.across is not None:
+            z, e = across.whiten(residual.affine), across.whiten(residual.across)
+        if residual.along is not None:
+            both = along.whiten(np.column_stack([residual.inner, residual.along]))
+            inner, r = both[:, :12], both[:, 12]
+        return cls(residual, across, along, z, e, inner, r)
+
+
+def grams(residual: Residual, terms: Terms, across: Colour, along: Colour | TurnedColour, blocks: int = 1) -> Grams:
     """Gram matrices of terms evaluated at the residual's samples, in contiguous blocks.
 
     Parameters
@@ -87,6 +117,12 @@ def grams(residual: Residual, terms: Terms, across: Colour, along: Colour, block
     terms: their series have the residual's samples as rows.
     across, along: the colours of the two parts of the residual.
     """
+    return grams_in(Whitened.of(residual, across, along), terms, blocks)
+
+
+def grams_in(white: Whitened, terms: Terms, blocks: int = 1) -> Grams:
+    """The same where several terms are judged in one residual."""
+    residual = white.residual
     n, size = len(residual.affine), len(residual.noise)
     edges = np.linspace(0, n, blocks + 1).round().astype(int)
     pieces = list(itertools.pairwise(edges))
@@ -94,24 +130,19 @@ def grams(residual: Residual, terms: Terms, across: Colour, along: Colour, block
     raw = terms.part_output != REFERENCE
     zz, zd, dd = np.zeros((blocks, 4, 4)), np.zeros((blocks, 4, k)), np.zeros((blocks, k, k))
     ze, de, ee = np.zeros((blocks, 4, size)), np.zeros((blocks, k, size)), np.zeros(blocks)
-    if residual.across is not None and raw.any():
-        z, d, e = across.whiten(residual.affine), across.whiten(terms.series), across.whiten(residual.across)
-        for i, (a, b) in enumerate(pieces):
-            zz[i], zd[i], dd[i] = z[a:b].T @ z[a:b], z[a:b].T @ d[a:b], d[a:b].T @ d[a:b]
-            ze[i], de[i], ee[i] = z[a:b].T @ e[a:b], d[a:b].T @ e[a:b], np.sum(e[a:b] ** 2)
-    elif residual.across is not None:
-        e = across.whiten(residual.across)
-        z = across.whiten(residual.affine)
+    if white.z is not None and white.e is not None:
+        z, e = white.z, white.e
+        d = white.across.whiten(terms.series) if raw.any() else None
         for i, (a, b) in enumerate(pieces):
             zz[i], ze[i], ee[i] = z[a:b].T @ z[a:b], z[a:b].T @ e[a:b], np.sum(e[a:b] ** 2)
+            if d is not None:
+                zd[i], dd[i], de[i] = z[a:b].T @ d[a:b], d[a:b].T @ d[a:b], d[a:b].T @ e[a:b]
     aa, ar, rr = np.zeros((blocks, 12 + p, 12 + p)), np.zeros((blocks, 12 + p)), np.zeros(blocks)
-    if residual.along is not None:
-        columns = np.zeros((n, 12 + p))
-        columns[:, :12] = residual.inner
-        columns[:, 12:] = _along(residual, terms)
-        columns, r = along.whiten(columns), along.whiten(residual.along)
+    if white.inner is not None and white.r is not None:
+        columns = np.column_stack([white.inner, white.along.whiten(_along(residual, terms))])
         for i, (a, b) in enumerate(pieces):
-            aa[i], ar[i], rr[i] = columns[a:b].T @ columns[a:b], columns[a:b].T @ r[a:b], r[a:b] @ r[a:b]
+            part, r = columns[a:b], white.r[a:b]
+            aa[i], ar[i], rr[i] = part.T @ part, part.T @ r, r @ r
     samples = np.diff(edges).astype(float)
     return Grams(
         zz, zd, dd, ze, de, ee, aa, ar, rr, samples,

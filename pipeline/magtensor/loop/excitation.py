@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from magtensor.calibration.types import Array
 from magtensor.errors import did_you_mean
+from magtensor.loop.quiet import quieted
 from magtensor.loop.terms import REFERENCE, Terms
 
 AXES = "xyz"
@@ -81,10 +82,22 @@ class Excitation:
             raise KeyError(f"no channel {name}{did_you_mean(name, self.logged)}")
         return self.logged[name]
 
+    def thermometer(self, name: str) -> Array:
+        """A logged temperature without the noise of its log: what has a thermal mass does not jump between samples."""
+        if name not in self._quiet:
+            values = self.channel(name)
+            columns = [quieted(column) for column in values.reshape(len(values), -1).T]
+            self._quiet[name] = np.column_stack(columns).reshape(values.shape)
+        return self._quiet[name]
+
     def is_vector(self, name: str) -> bool:
         """Whether a logged channel has a value for each axis rather than one, or one for each sensor."""
         shape = self.channel(name).shape
         return len(shape) == 2 and shape[1] == 3 and (len(self.sensors) != 3 or name in VECTORS)
+
+    @cached_property
+    def _quiet(self) -> dict[str, Array]:
+        return {}
 
     @cached_property
     def uniform(self) -> bool:
@@ -153,7 +166,7 @@ class Excitation:
         out = np.zeros_like(np.asarray(series, dtype=float))
         for a, b in self.runs():
             if b - a >= 5:
-                out[a:b] = _derivative(self.time[a:b], series[a:b])
+                out[a:b] = derivative_of(self.time[a:b], series[a:b])
             elif b - a >= 2:
                 out[a:b] = np.gradient(series[a:b], self.time[a:b], axis=0)
         return out
@@ -291,7 +304,7 @@ def _recursion(decay: Array, drive: Array) -> Array:
     return out
 
 
-def _derivative(time: Array, series: Array) -> Array:
+def derivative_of(time: Array, series: Array) -> Array:
     """Fourth-order central differences where samples are evenly spaced, else those of a cubic spline."""
     step = np.diff(time)
     if np.ptp(step) < 1e-3 * step.mean():

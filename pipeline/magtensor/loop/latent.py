@@ -163,7 +163,7 @@ def tried_source(
         return replace(found, objection="its waveform follows the direction of the field"), None
     model = Adopted(component, {"noise_nT": [float(v) for v in after.residual.noise]})
     after = replace(after, adopted=(*after.adopted[:-1], model))
-    evidence = Assessment(estimate, found.gain, found.gain, found.p, state.colours)
+    evidence = Assessment(estimate, found.gain, found.gain, found.p, found.p, state.colours, estimate.theta)
     return found, Source(record, after, Candidate(model, 1, terms, evidence, found.p, ALPHA))
 
 

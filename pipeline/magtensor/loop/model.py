@@ -12,15 +12,16 @@ from numpy.typing import NDArray
 from magtensor.calibration.joint import JointFit, fit_joint, nearest_frame
 from magtensor.calibration.types import Array
 from magtensor.components import Component
-from magtensor.loop.assessment import Colours, colours_of, estimated
+from magtensor.loop.assessment import Colours, colours_of, estimated, log_likelihood
 from magtensor.loop.excitation import Excitation
-from magtensor.loop.residual import Residual, residual_of
+from magtensor.loop.residual import Residual, residual_of, taken_off
 from magtensor.loop.statistics import Estimate
 from magtensor.loop.terms import Terms, joined
 
 _MOST_ROUNDS = 6
-LEAST_CLEARANCE = 10.0  # power over noise power of a frequency that a regressor may use
 _SETTLED = 0.02  # of a standard deviation
+_SHARES = (1.0, 0.5, 0.1)  # of a step, tried in this order
+_LIKELIHOOD_ROUNDING = 0.5  # a spectrum fitted anew is not the same to the last digit
 
 
 @dataclass(frozen=True)
@@ -77,28 +78,6 @@ class Record:
             self.time, self.start, self.sensors, output, field_, self.quiet_field, self.logged, self.units, self.run,
             self.segment, self.position, self.attitude, tuple(lines), self.waveform,
         )  # fmt: skip
-
-
-def quieted(values: Array) -> Array:
-    """A reference record (N,), evenly sampled at its own times, without its own white noise: a Wiener filter.
-
-    A reference's noise is in the residual too; a regressor that held it would seem to explain it. So a frequency is
-    kept only where the record's power is well above the noise that second differences show.
-    """
-    from scipy.fft import dct, idct
-
-    n = len(values)
-    if n < 16:
-        return np.full(n, values.mean())
-    second = np.diff(values, n=2)
-    noise = float(np.median(second**2)) / 0.4549 / 6.0
-    trend = np.polynomial.Polynomial.fit(np.arange(n), values, 1)(np.arange(n))
-    coefficients = dct(values - trend, norm="ortho")
-    width = max(n // 100, 5)
-    smooth = np.convolve(coefficients**2, np.ones(width) / width, mode="same")
-    gain = np.where(smooth > LEAST_CLEARANCE * noise, 1.0 - noise / np.maximum(smooth, 1e-300), 0.0)
-    out: Array = idct(coefficients * gain, norm="ortho") + trend
-    return out
 
 
 @dataclass(frozen=True)
@@ -207,11 +186,13 @@ def joint_state(
                 each = [a.terms(x) for a in adopted]
         residual = residual_of(fit, raw, reference, how.reference_noise)
         terms = joined(each).at(residual.samples)
-        estimate = estimated(residual, terms, colours_of(residual))
+        colours = colours_of(residual)
+        estimate = estimated(residual, terms, colours)
         edges = np.cumsum([e.count for e in each])[:-1]
         before = np.concatenate(theta)
         # what no data show stays zero, whatever earlier rounds made of it
-        after = estimate.seen(before) + estimate.theta
+        shown = estimate.seen(before)
+        after = shown + _share(residual, terms, estimate.theta, colours) * estimate.theta
         theta = np.split(after, edges)
         raw, reference = without(record, each, theta)
         step = np.abs(after - before) / np.sqrt(np.maximum(np.diag(estimate.covariance), 1e-300))
@@ -223,6 +204,20 @@ def joint_state(
     if adopted:
         terms = joined([a.terms(x) for a in adopted]).at(residual.samples)
     return State(tuple(adopted), tuple(theta), fit, residual, x, terms, colours_of(residual), estimate, tuple(lines))
+
+
+def _share(residual: Residual, terms: Terms, step: Array, colours: Colours) -> float:
+    """The part of a step that makes the residual, in noise of its own colour then, likelier; 0 if none does.
+
+    The step is the best one in noise of the colour that the residual has now, and the colour changes with it: a slow
+    effect not quite taken off looks like slow noise, in which it is then taken off even less.
+    """
+    now = log_likelihood(residual, colours)
+    for share in _SHARES:
+        left = taken_off(residual, terms, share * step)
+        if log_likelihood(left, colours_of(left)) >= now - _LIKELIHOOD_ROUNDING:
+            return share
+    return 0.0
 
 
 def _fit(raw: Array, reference: Array | None, how: Fitting, keep: NDArray[np.bool_] | None) -> JointFit:

@@ -11,27 +11,28 @@ from collections.abc import Callable
 import numpy as np
 
 from magtensor.components import Component
-from magtensor.loop.excitation import Excitation
+from magtensor.loop.excitation import Excitation, derivative_of
 from magtensor.loop.settings import AnyChannel
 
 LARGEST_TURN = 0.5  # rad between neighbouring samples above which rates of change mean nothing
-ROUGHEST = 0.5  # second over first differences: noise alone gives 1.7, attitudes one by one 1.7, a smooth turn little
+LEAST_IN_A_RUN = 8  # samples that show a rate of change, and whether it is right
+WORST_RATE = 0.5  # of the rate of change, moved by leaving out every second sample; with all of them the error of a
+# difference formula is then some tenths of that, where the attitudes are unrelated all of it and more
 
 
 def _turns(x: Excitation) -> bool:
     """Whether the field turns, and slowly enough between the samples of a run for its rate to be known."""
-    together = np.diff(x.run) == 0
-    if not together.any():
-        return False
     b = x.field[:, 0]
-    first = np.diff(b, axis=0)
-    thrice = together[1:] & together[:-1]
-    if not thrice.any():
+    together = np.diff(x.run) == 0
+    long_runs = [(i, j) for i, j in x.runs() if j - i >= LEAST_IN_A_RUN]
+    if not long_runs or not together.any():
         return False
-    change = float(np.mean(np.sum(first[together] ** 2, axis=1)))
-    bend = float(np.mean(np.sum(np.diff(first, axis=0)[thrice] ** 2, axis=1)))
-    typical = np.sqrt(change / np.mean(np.sum(b**2, axis=1)))
-    return bool(bend < ROUGHEST**2 * change and typical < LARGEST_TURN)
+    change = np.diff(b, axis=0)[together]
+    typical = np.sqrt(np.mean(np.sum(change**2, axis=1)) / np.mean(np.sum(b**2, axis=1)))
+    rates = [(derivative_of(x.time[i:j], b[i:j])[::2], derivative_of(x.time[i:j:2], b[i:j:2])) for i, j in long_runs]
+    every, half = (np.concatenate(each) for each in zip(*rates, strict=True))
+    moved = np.sqrt(np.sum((every - half) ** 2) / max(float(np.sum(every**2)), 1e-300))
+    return bool(moved < WORST_RATE and typical < LARGEST_TURN)
 
 
 FACTS: dict[str, Callable[[Excitation], bool]] = {

@@ -6,8 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from magtensor.loop.assessment import Colours, block_count
-from magtensor.loop.colour import Colour
+from magtensor.loop.assessment import WHITE, block_count
 from magtensor.loop.evidence import grams
 from magtensor.loop.model import Adopted, Record, State
 from magtensor.loop.screening import Candidate, profiled
@@ -16,8 +15,6 @@ from magtensor.loop.settings import Range
 from magtensor.loop.statistics import held_out_gain
 from magtensor.loop.terms import joined
 from magtensor.loop.waveform import NAME
-
-WHITE = Colours(Colour(None, 1.0), Colour(None, 1.0))
 
 
 def described(found: Search, record: Record, declared: int) -> dict[str, Any]:
@@ -111,6 +108,8 @@ def _rejected(found: Search) -> list[dict[str, Any]]:
         for candidate in step.candidates:
             if step.adopted is None or candidate is not step.adopted:
                 last[candidate.model.name] = f"round {number}: {why(candidate, step.adopted)}"
+        for name, reason in step.refused.items():
+            last[name] = f"round {number}: {reason}"
         for name in step.dropped:
             last[name] = f"round {number}: dropped, no longer significant beside the others"
     if found.shared is not None and found.shared.significant:

@@ -8,13 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtensor.calibration.types import Array
-from magtensor.loop.model import Record, quieted
+from magtensor.loop.model import Record
+from magtensor.loop.quiet import quieted
 from magtensor.survey.model import Survey
 
 NOT_CHANNELS = (
     "time", "sensor", "axis", "b_raw", "position", "good", "segment", "attitude", "quaternion", "total_field",
     "total_field_std", "diurnal",
 )  # fmt: skip
+CLEARANCE = 10.0  # the reference's noise is in the residual too: what held it would seem to explain it
 GAP = 5.0  # median steps: a longer one begins a new run
 
 
@@ -106,7 +108,7 @@ def _quiet(survey: Survey, time: Array, total_field: Array | None) -> Array | No
     if known.sum() < 2:
         return total_field
     latency = float(survey["total_field"].attrs.get("latency_s", 0.0))
-    smooth = np.interp(time, at[known] - latency, quieted(values[known]))
+    smooth = np.interp(time, at[known] - latency, quieted(values[known], CLEARANCE))
     return np.where(np.isfinite(total_field), smooth, np.nan)
 
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from magtensor.calibration.joint import JointFit
 from magtensor.calibration.types import Array
 from magtensor.loop.terms import Terms
+from magtensor.loop.turned import SlowModes
 
 
 @dataclass(frozen=True)
@@ -32,6 +33,7 @@ class Residual:
         projector: (3 S, 3 S).
         noise: (3 S,) nT by which the outputs were divided.
         samples: (N,) their numbers in the survey.
+        slow_modes: how slow noise of the sensors shows along.
     """
 
     across: Array | None
@@ -43,6 +45,7 @@ class Residual:
     projector: Array
     noise: Array
     samples: NDArray[np.int_]
+    slow_modes: SlowModes
 
     @property
     def freedom(self) -> int:
@@ -75,6 +78,7 @@ class Residual:
             gain=self.gain[keep],
             reference_gain=self.reference_gain[keep],
             samples=self.samples[keep],
+            slow_modes=SlowModes(self.slow_modes.response[keep]),
         )
 
 
@@ -107,6 +111,7 @@ def residual_of(fit: JointFit, raw: Array, total_field: Array | None, reference_
         projector=np.eye(size) - plane.basis @ plane.basis.T,
         noise=plane.noise,
         samples=keep,
+        slow_modes=SlowModes(g / spread[:, None]),
     )
 
 

@@ -8,12 +8,22 @@ from typing import Any
 
 import numpy as np
 
+from magtensor.calibration.types import Array
 from magtensor.components import Component
-from magtensor.loop.assessment import Assessment, Colours, assess, estimated, explained
-from magtensor.loop.colour import Colour
+from magtensor.loop.assessment import (
+    WHITE,
+    Assessment,
+    Colours,
+    assess,
+    colours_of,
+    estimated_in,
+    explained,
+)
+from magtensor.loop.evidence import Whitened
 from magtensor.loop.excitation import Excitation
 from magtensor.loop.log_noise import brought_in
 from magtensor.loop.model import Adopted, State
+from magtensor.loop.multiplicity import alike, effective_tests, projected
 from magtensor.loop.residual import Residual
 from magtensor.loop.settings import EventTimes, Range
 from magtensor.loop.terms import Terms, joined
@@ -22,10 +32,8 @@ ALPHA = 0.005  # family-wise probability that a clean survey gets an adoption, b
 LEAST_REDUCTION = 1e-4  # of the held-out sum of squares: smaller is significant only in very long surveys
 LOG_MARGIN = 1.5  # the noise of a log is known to some per cent, and a dozen coefficients gain a little by chance
 SCREENED = 8  # models looked at closely in each round
-SCREENING_SAMPLES = 4000  # settings are profiled on so many samples
+SCREENING_SAMPLES = 2000  # settings are profiled on so many samples
 _REFINEMENTS = 8
-
-WHITE = Colours(Colour(None, 1.0), Colour(None, 1.0))
 
 
 @dataclass(frozen=True)
@@ -34,7 +42,7 @@ class Candidate:
 
     Attributes:
         model: component and settings.
-        tried: settings tried for it, for the correction of its p value.
+        tried: independent tests that the settings tried for it amount to, for the correction of its p value.
         terms: at the residual's samples.
         assessment: of the terms, given the models adopted before.
         adjusted_p: after the correction for settings and for the number of models.
@@ -43,7 +51,7 @@ class Candidate:
     """
 
     model: Adopted
-    tried: int
+    tried: float
     terms: Terms
     assessment: Assessment
     adjusted_p: float
@@ -53,16 +61,17 @@ class Candidate:
     @property
     def of_the_log(self) -> bool:
         """Whether noise in the log of a channel explains what it gains."""
-        return self.assessment.gain.total <= LOG_MARGIN * self.log_noise
+        return 0.0 < self.assessment.gain.total <= LOG_MARGIN * self.log_noise
 
     @property
     def passes(self) -> bool:
         """Both gates."""
         if self.of_the_log:
             return False
-        gain, null = self.assessment.gain, self.assessment.null_gain
+        gain = self.assessment.gain
         reduction = gain.total / max(float(gain.before.sum()), 1e-300)
-        return self.adjusted_p < self.alpha and null.total > 0 and gain.consistent and reduction > LEAST_REDUCTION
+        beyond_slow_noise = self.assessment.null_gain.total > 0
+        return self.adjusted_p < self.alpha and beyond_slow_noise and gain.consistent and reduction > LEAST_REDUCTION
 
 
 def repeatable(model: Component) -> bool:
@@ -94,50 +103,122 @@ def settings_grid(model: Component, x: Excitation) -> list[dict[str, Any]]:
 def candidates_of(state: State, models: Sequence[Component], failed: dict[str, str], alpha: float) -> list[Candidate]:
     """The most promising models with their best settings, assessed; their p values corrected for all that was tried."""
     residual = state.residual
-    step = -(-len(residual.affine) // SCREENING_SAMPLES)
-    thin = np.arange(0, len(residual.affine), step)
-    few = Scorer(residual.smaller(thin), None if state.terms is None else state.terms.at(thin), WHITE)
     white = Scorer(residual, state.terms, WHITE)
     coloured = Scorer(residual, state.terms, state.colours)
-    scored: list[tuple[float, float, Component, dict[str, Any], int]] = []
+    few = _Thinned.of(state)
+    scored: list[_Screened] = []
     for model in models:
-        grid = [g for g in settings_grid(model, state.excitation) if not _already(state, model, g)]
-        best: tuple[float, dict[str, Any]] | None = None
-        for settings in grid:
+        for settings, tried in _best_settings(model, state, few, failed, alpha / max(len(models), 1)):
             terms = _terms(model, settings, state.excitation, failed)
-            if terms is None or not terms.count:
-                continue
-            score = few(terms.at(residual.samples[thin])) if len(grid) > 1 else 0.0
-            if best is None or score > best[0]:
-                best = (score, settings)
-        if best is None:
+            assert terms is not None
+            terms = terms.at(residual.samples)
+            scored.append(_Screened(model, settings, tried, white(terms), coloured(terms)))
+    names = {s.model.name for s in scored}
+    looked_at = _shortlist(scored, lambda s: s.white) + _shortlist(scored, lambda s: s.coloured)
+    assessed: dict[tuple[str, str], tuple[Adopted, float, Terms, Assessment]] = {}
+    for each in looked_at:
+        settings = _refined(residual, each.model, each.settings, state, failed)
+        key = each.model.name, str(settings)
+        if key in assessed:
             continue
-        terms = _terms(model, best[1], state.excitation, failed)
-        assert terms is not None
-        terms = terms.at(residual.samples)
-        scored.append((white(terms), coloured(terms), model, best[1], len(grid)))
-    white_first = sorted(scored, key=lambda s: -s[0])[: SCREENED // 2]
-    coloured_first = sorted(scored, key=lambda s: -s[1])[: SCREENED - SCREENED // 2]
-    looked_at = list({id(s): s for s in (*white_first, *coloured_first)}.values())
-    found = []
-    for _, _, model, settings, tried in looked_at:
-        settings, refined = _refined(residual, model, settings, state, failed)
-        terms = _terms(model, settings, state.excitation, failed)
+        terms = _terms(each.model, settings, state.excitation, failed)
         assert terms is not None
         terms = terms.at(residual.samples)
         assessment = assess(residual, terms, state.colours, state.terms)
-        found.append((Adopted(model, settings), tried + refined, terms, assessment))
+        assessed[key] = Adopted(each.model, settings), each.tried, terms, assessment
+    found = _one_each(list(assessed.values()))
     order = sorted(range(len(found)), key=lambda i: min(1.0, found[i][3].p * found[i][1]))
     adjusted = np.ones(len(found))
     running = 0.0
     for rank, i in enumerate(order):  # Holm: the models not looked at closely count as less significant ones
-        running = max(running, min(1.0, found[i][3].p * found[i][1] * max(len(scored) - rank, 1)))
+        running = max(running, min(1.0, found[i][3].p * found[i][1] * max(len(names) - rank, 1)))
         adjusted[i] = running
     candidates = [
         Candidate(model, tried, terms, assessment, float(p), alpha, _log_noise(state, model))
         for (model, tried, terms, assessment), p in zip(found, adjusted, strict=True)
     ]
     return sorted(candidates, key=lambda c: -c.assessment.gain.total)
+
+
+@dataclass(frozen=True)
+class _Screened:
+    """A model with settings, and what it explains in white noise and in noise of the residual's colour."""
+
+    model: Component
+    settings: dict[str, Any]
+    tried: float
+    white: float
+    coloured: float
+
+
+@dataclass(frozen=True)
+class _Thinned:
+    """Some samples of a residual, on which settings are profiled, and how terms score there."""
+
+    residual: Residual
+    white: Scorer
+    coloured: Scorer
+
+    @classmethod
+    def of(cls, state: State) -> _Thinned:
+        count = len(state.residual.affine)
+        thin = np.arange(0, count, -(-count // SCREENING_SAMPLES))
+        residual = state.residual.smaller(thin)
+        given = None if state.terms is None else state.terms.at(thin)
+        return cls(residual, Scorer(residual, given, WHITE), Scorer(residual, given, colours_of(residual)))
+
+
+def _best_settings(
+    model: Component, state: State, few: _Thinned, failed: dict[str, str], alpha: float
+) -> list[tuple[dict[str, Any], float]]:
+    """The settings that explain most in white noise and in noise of the residual's own colour, if they differ.
+
+    In white noise what is slow decides, in coloured noise what is fast. Beside each the number of independent tests
+    that all settings amount to.
+    """
+    grid = [g for g in settings_grid(model, state.excitation) if not _already(state, model, g)]
+    if len(grid) == 1:
+        terms = _terms(model, grid[0], state.excitation, failed)
+        return [(grid[0], 1.0)] if terms is not None and terms.count else []
+    scores: list[tuple[float, float, dict[str, Any]]] = []
+    chain: list[float] = []
+    last: Array | None = None
+    for settings in grid:
+        terms = _terms(model, settings, state.excitation, failed)
+        if terms is None or not terms.count:
+            continue
+        terms = terms.at(few.residual.samples)
+        scores.append((few.white(terms), few.coloured(terms), settings))
+        series = projected(terms, few.residual.affine)
+        if last is not None:
+            chain.append(alike(last, series))
+        last = series
+    if not scores:
+        return []
+    tried = effective_tests(chain, alpha)
+    best = max(scores, key=lambda s: s[0])[2], max(scores, key=lambda s: s[1])[2]
+    return [(settings, tried) for settings in (best[:1] if best[0] is best[1] else best)]
+
+
+def _shortlist(scored: Sequence[_Screened], score: Callable[[_Screened], float]) -> list[_Screened]:
+    """The models that explain most, each with the settings that do."""
+    best: dict[str, _Screened] = {}
+    for each in scored:
+        if each.model.name not in best or score(each) > score(best[each.model.name]):
+            best[each.model.name] = each
+    return sorted(best.values(), key=score, reverse=True)[: SCREENED // 2]
+
+
+def _one_each(
+    assessed: Sequence[tuple[Adopted, float, Terms, Assessment]],
+) -> list[tuple[Adopted, float, Terms, Assessment]]:
+    """Of a model that was assessed with two settings, the one that predicts better."""
+    best: dict[str, tuple[Adopted, float, Terms, Assessment]] = {}
+    for each in assessed:
+        name = each[0].name
+        if name not in best or each[3].gain.total > best[name][3].gain.total:
+            best[name] = each
+    return list(best.values())
 
 
 def _log_noise(state: State, model: Adopted) -> float:
@@ -180,21 +261,20 @@ class Scorer:
     """What terms explain beyond the adopted ones, less what as many random regressors would, in units of chance."""
 
     def __init__(self, residual: Residual, adopted: Terms | None, colours: Colours) -> None:
-        self.residual, self.adopted, self.colours = residual, adopted, colours
-        self.own = 0.0 if adopted is None else explained(estimated(residual, adopted, colours))
+        self.white, self.adopted = Whitened.of(residual, colours.across, colours.along), adopted
+        self.own = 0.0 if adopted is None else explained(estimated_in(self.white, adopted))
 
     def __call__(self, terms: Terms) -> float:
         together = terms if self.adopted is None else joined([self.adopted, terms])
-        estimate = estimated(self.residual, together, self.colours)
+        estimate = estimated_in(self.white, together)
         rank = max(min(estimate.rank, terms.count), 1)
         return (explained(estimate) - self.own - rank) / float(np.sqrt(2.0 * rank))
 
 
 def _refined(
     residual: Residual, model: Component, settings: dict[str, Any], state: State, failed: dict[str, str]
-) -> tuple[dict[str, Any], int]:
+) -> dict[str, Any]:
     """Settings on a range, moved between the neighbours of the best grid value by golden section."""
-    tried = 0
     for name, grid in profiled(model).items():
         if not isinstance(grid, (Range, EventTimes)):
             continue
@@ -211,13 +291,12 @@ def _refined(
             found = _terms(model, {**rest, name: value}, state.excitation, failed)
             return -np.inf if found is None else score(found.at(residual.samples))
 
-        best, count = golden(gain, low, high, settings[name])
-        settings = {**settings, name: best}
-        tried += count
-    return settings, tried
+        settings = {**settings, name: golden(gain, low, high, settings[name])}
+    return settings
 
 
-def golden(f: Callable[[float], float], low: float, high: float, best: float) -> tuple[float, int]:
+def golden(f: Callable[[float], float], low: float, high: float, best: float) -> float:
+    """Where f is largest between two limits, by golden section; `best` if nothing exceeds f there."""
     ratio = (np.sqrt(5.0) - 1) / 2
     a, b = low, high
     c, d = b - ratio * (b - a), a + ratio * (b - a)
@@ -232,4 +311,4 @@ def golden(f: Callable[[float], float], low: float, high: float, best: float) ->
             d = a + ratio * (b - a)
             fd = f(d)
     value, top = (c, fc) if fc > fd else (d, fd)
-    return (float(value), _REFINEMENTS) if top > known else (best, _REFINEMENTS)
+    return float(value) if top > known else best

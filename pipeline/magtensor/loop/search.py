@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -25,8 +25,9 @@ from magtensor.loop.residual import Residual
 from magtensor.loop.screening import ALPHA, Candidate, Scorer, candidates_of, generic, golden, profiled, repeatable
 from magtensor.loop.settings import Range
 from magtensor.loop.spectrum import spectral_lines
-from magtensor.loop.statistics import Gain, family_p, held_out_gain
+from magtensor.loop.statistics import LEAST_T, Gain, family_p, held_out_gain
 from magtensor.loop.terms import Terms, joined
+from magtensor.loop.trial import Trial, trial
 
 SEPARATION = 9.0  # twice the log likelihood ratio between two models below which the data do not tell them apart
 KEEP_ALPHA = 0.01  # an adopted effect that is no longer significant at this level is dropped
@@ -40,9 +41,10 @@ class Step:
 
     Attributes:
         before: state before; candidates: by held-out gain, best first.
-        adopted: the candidate adopted, None in the last round.
+        adopted: the candidate adopted, None where none was.
         rivals: names of models that the data do not separate from it.
         dropped: models dropped after the refit.
+        refused: model -> why it was not kept after it had been fitted.
     """
 
     before: State
@@ -50,6 +52,7 @@ class Step:
     adopted: Candidate | None
     rivals: tuple[str, ...] = ()
     dropped: tuple[str, ...] = ()
+    refused: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -103,6 +106,7 @@ def search(
     hidden = next((m for m in models if m.name == NAME), None)
     not_tested.pop(NAME, None)
     shared: Sought | None = None
+    standing = trial(record, first, how)
     steps: list[Step] = []
     failed: dict[str, str] = {}
     for _ in range(most_effects + 1):
@@ -112,31 +116,86 @@ def search(
         taken = {a.name for a in state.adopted}
         open_ = [m for m in testable if m.name not in taken or repeatable(m)]
         candidates = candidates_of(state, open_, failed, alpha)
-        passing = [c for c in candidates if c.passes]
-        if not passing:
-            shared = sought(state, record)
-            source = None
-            if shared is not None and hidden is not None and NAME not in taken:
-                shared, source = tried_source(hidden, record, state, shared, how, alpha)
-            if source is None:
-                steps.append(Step(state, tuple(candidates), None))
-                break
-            if say is not None:
-                say(f"adopting {NAME}")
-            steps.append(Step(state, tuple(candidates), source.evidence))
-            record, state, shared = source.record, source.after, None
+        adopted = _first_kept(record, standing, candidates, how, len(declared), say)
+        steps.append(Step(state, tuple(candidates), *adopted.step))
+        if adopted.standing is not None:
+            record, state = renewed(record, adopted.standing.state, how)
+            standing = replace(adopted.standing, state=state)
             continue
+        shared = sought(state, record)
+        if shared is None or hidden is None or NAME in taken:
+            break
+        shared, source = tried_source(hidden, record, state, shared, how, alpha)
+        if source is None:
+            break
+        if say is not None:
+            say(f"adopting {NAME}")
+        steps[-1] = replace(steps[-1], adopted=source.evidence)
+        record, state, shared = source.record, source.after, None
+        standing = trial(record, state, how)
+    return Search(first, state, tuple(steps), not_tested, failed, record, shared or sought(state, record))
+
+
+@dataclass(frozen=True)
+class _Kept:
+    """The outcome of a round; `standing` is None where nothing was kept."""
+
+    standing: Trial | None
+    chosen: Candidate | None = None
+    rivals: tuple[str, ...] = ()
+    dropped: tuple[str, ...] = ()
+    refused: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def step(self) -> tuple[Candidate | None, tuple[str, ...], tuple[str, ...], Mapping[str, str]]:
+        return self.chosen, self.rivals, self.dropped, self.refused
+
+
+def _first_kept(
+    record: Record,
+    before: Trial,
+    candidates: Sequence[Candidate],
+    how: Fitting,
+    fixed: int,
+    say: Callable[[str], None] | None,
+) -> _Kept:
+    """Fit the candidates that pass, the best first, until one is kept."""
+    refused: dict[str, str] = {}
+    while passing := [c for c in candidates if c.passes and c.model.name not in refused]:
         best = max(passing, key=lambda c: c.assessment.gain.total)
-        chosen, rivals = _simplest(best, candidates, state)
+        chosen, rivals = _simplest(best, passing, before.state)
         if say is not None:
             say(f"adopting {chosen.model.name}")
-        after = _polished(record, _adopt(record, state, chosen, how), how)
-        after, dropped = _eliminate(record, after, how, len(declared))
-        steps.append(Step(state, tuple(candidates), chosen, rivals, dropped))
-        if chosen.model.name in dropped and len(after.adopted) <= len(state.adopted):
-            break
-        record, state = renewed(record, after, how)
-    return Search(first, state, tuple(steps), not_tested, failed, record, shared or sought(state, record))
+        after, why = _kept(record, before, chosen, how)
+        if after is None:
+            refused[chosen.model.name] = why
+            continue
+        last, dropped = _eliminate(record, after.state, how, fixed)
+        if dropped:
+            after = trial(record, last, how)
+        if chosen.model.name in dropped and len(last.adopted) <= len(before.state.adopted):
+            return _Kept(None, chosen, rivals, dropped, refused)
+        return _Kept(after, chosen, rivals, dropped, refused)
+    return _Kept(None, refused=refused)
+
+
+def _kept(record: Record, before: Trial, chosen: Candidate, how: Fitting) -> tuple[Trial | None, str]:
+    """The fit with a model, on fewer sensors where it hurts one that it does not help; None, and why, if it fails."""
+    after = trial(record, _polished(record, _adopt(record, before.state, chosen, how), how), how)
+    hurt = before.hurt_by(after)
+    if hurt:
+        which = len(before.state.adopted)
+        own = after.state.adopted[which].sensors or tuple(record.sensors)
+        helped = [s for s in before.helped_by(after) if s in own]
+        if helped and set(chosen.terms.sensors) >= set(own):
+            narrowed = _narrowed(record, after.state, which, tuple(helped), how)
+            after = trial(record, narrowed, how)
+            hurt = before.hurt_by(after)
+    if hurt:
+        return None, f"fitted, it raises the held-out error of {', '.join(hurt)}"
+    if not before.likelier(after):
+        return None, "fitted together with the others, it leaves more than it takes away"
+    return after, ""
 
 
 def _require_channels(x: Excitation, declared: Sequence[Adopted]) -> None:
@@ -172,7 +231,7 @@ def _simplest(best: Candidate, candidates: Sequence[Candidate], state: State) ->
         if other is best or not other.passes:
             continue
         gain = _fold_gain(other, residual, state, colours)
-        if reference.total - gain.total < SEPARATION:
+        if reference.total - gain.total < max(SEPARATION, LEAST_T * reference.apart(gain)):
             equal.append(other)
     chosen = min(equal, key=lambda c: (generic(c.model), c.assessment.estimate.rank, -c.assessment.gain.total))
     return chosen, tuple(sorted({c.model.name for c in equal if c is not chosen} - {chosen.model.name}))
@@ -193,15 +252,27 @@ def _fold_gain(candidate: Candidate, residual: Residual, state: State, colours: 
 
 def _adopt(record: Record, state: State, chosen: Candidate, how: Fitting) -> State:
     """Refit with the chosen model, first on all sensors, then on those that show it."""
-    start: list[Array] = [*state.theta, np.zeros(chosen.terms.count)]
+    # what it found of the others too: begun from zero, a strong slow effect would pass for the colour of the noise
+    moves = np.split(chosen.assessment.theta, np.cumsum([len(t) for t in state.theta]))
+    start = [t + move for t, move in zip([*state.theta, np.zeros(chosen.terms.count)], moves, strict=True)]
     after = joint_state(record, [*state.adopted, chosen.model], how, start)
     sensors = _sensors_showing(after, len(state.adopted))
     if sensors is None or not _spare(after, len(state.adopted), sensors):
         return after
-    narrowed = Adopted(chosen.model.component, chosen.model.settings, sensors)
-    every = chosen.terms
-    keep = [i for i, s in enumerate(every.sensors) if s in sensors or s == ""]
-    return joint_state(record, [*state.adopted, narrowed], how, [*state.theta, after.theta[-1][keep]])
+    return _narrowed(record, after, len(state.adopted), sensors, how)
+
+
+def _narrowed(record: Record, state: State, which: int, sensors: tuple[str, ...], how: Fitting) -> State:
+    """Refit with one of the models on some of its sensors only."""
+    model = state.adopted[which]
+    models = list(state.adopted)
+    models[which] = Adopted(model.component, model.settings, sensors)
+    assert state.terms is not None
+    part = _slices(state)[which]
+    keep = [i for i, s in enumerate(state.terms.sensors[part]) if s in sensors or s == ""]
+    theta = list(state.theta)
+    theta[which] = theta[which][keep]
+    return joint_state(record, models, how, theta)
 
 
 def _spare(state: State, which: int, sensors: tuple[str, ...]) -> bool:
@@ -248,7 +319,7 @@ def _polished(record: Record, state: State, how: Fitting) -> State:
                 return score(trial.terms(at.excitation).at(at.residual.samples))
 
             here = float(now.settings[name])
-            best, _ = golden(gain, here * (1 - POLISH), here * (1 + POLISH), here)
+            best = golden(gain, here * (1 - POLISH), here * (1 + POLISH), here)
             if best != here:
                 changed = Adopted(now.component, {**now.settings, name: best}, now.sensors)
                 models = [changed if i == number else a for i, a in enumerate(state.adopted)]

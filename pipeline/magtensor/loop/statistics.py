@@ -211,6 +211,11 @@ class Gain:
         spread = float(each.std(ddof=1))
         return float(each.mean() / (spread / np.sqrt(len(each)))) if spread > 0 else 0.0
 
+    def apart(self, other: Gain) -> float:
+        """Standard error of the difference to another gain on the same folds."""
+        each = self.after - other.after
+        return float(np.sqrt(len(each)) * each.std(ddof=1)) if len(each) > 1 else 0.0
+
     @property
     def consistent(self) -> bool:
         """Whether the gain is there in nearly every fold, or on average by more than its scatter explains."""

@@ -12,11 +12,12 @@ from typing import Any
 
 import numpy as np
 
+from magtensor.loop.assessment import WHITE
 from magtensor.loop.direction import direction_series
 from magtensor.loop.excitation import Excitation
 from magtensor.loop.latent import shared_words
 from magtensor.loop.model import Record, State
-from magtensor.loop.screening import WHITE, Candidate
+from magtensor.loop.screening import Candidate
 from magtensor.loop.search import Search
 from magtensor.loop.spectrum import spectral_lines
 from magtensor.loop.terms import Terms
@@ -35,7 +36,7 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
     line = strongest_line(state, record)
     turning = predictable_from_direction(state)
     last = found.steps[-1].candidates if found.steps else ()
-    suspects = [c for c in last if c.adjusted_p < c.alpha and not c.of_the_log]
+    suspects = [c for c in last if c.adjusted_p < c.alpha and c.assessment.null_p < ALPHA and not c.of_the_log]
     words: list[str] = []
     if found.shared is not None and found.shared.significant:
         words.append(shared_words(found.shared, record.sensors))
