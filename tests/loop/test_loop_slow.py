@@ -1,0 +1,131 @@
+"""What is slow: noise that looks like an effect, effects that look like noise, and logs with noise of their own."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from loop_cases import adopted_names, scenario, verdict_of
+from numpy.typing import NDArray
+from scipy.signal import lfilter
+from scipy.stats import norm
+
+from magtensor.loop.colour import Colour, colour_of
+from magtensor.loop.multiplicity import effective_tests
+from magtensor.loop.quiet import quieted
+from magtensor.loop.turned import SlowModes, TurnedColour, excess_of, excess_of_one
+
+Array = NDArray[np.float64]
+
+
+def test_tests_that_are_one_and_the_same_count_once_and_unrelated_ones_each() -> None:
+    assert effective_tests([], 0.01) == 1.0
+    assert effective_tests([1.0] * 9, 0.01) == pytest.approx(1.0)
+    assert effective_tests([0.0] * 9, 0.01) == pytest.approx(10.0, rel=2e-3)
+
+
+@pytest.mark.parametrize("r", [0.5, 0.9, 0.99])
+def test_a_chain_of_dependent_tests_keeps_its_level(r: float) -> None:
+    alpha, count, trials = 0.05, 20, 20_000
+    rng = np.random.default_rng(31)
+    drive = rng.standard_normal((count, trials)) * np.sqrt(1 - r**2)
+    drive[0] /= np.sqrt(1 - r**2)
+    chain = lfilter([1.0], [1.0, -r], drive, axis=0)
+    limit = norm.isf(alpha / effective_tests([r] * (count - 1), alpha) / 2)
+    alarms = float(np.mean(np.abs(chain).max(axis=0) > limit))
+    assert alarms < alpha + 3 * np.sqrt(alpha / trials)
+    bonferroni = float(np.mean(np.abs(chain).max(axis=0) > norm.isf(alpha / count / 2)))
+    assert alarms > bonferroni
+
+
+def turning(rng: np.random.Generator, n: int) -> Array:
+    """(N, 3) unit vectors that tumble."""
+    angles = np.cumsum(0.1 + 0.03 * rng.standard_normal((n, 2)), axis=0)
+    polar, azimuth = np.pi / 2 + 0.9 * np.sin(0.7 * angles[:, 0]), angles[:, 1]
+    return np.column_stack([np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)])
+
+
+def slow_noise(rng: np.random.Generator, n: int, columns: int) -> Array:
+    """White noise and a random walk, (N, columns)."""
+    return rng.standard_normal((n, columns)) + 0.05 * np.cumsum(rng.standard_normal((n, columns)), axis=0)
+
+
+@pytest.mark.parametrize("single", [False, True])
+def test_slow_noise_of_a_turning_sensor_is_not_mistaken_for_a_slow_effect(single: bool) -> None:
+    """Three trends turned with the platform explain three of chi-square, if the noise's covariance is right."""
+    n, trials = 2000, 40
+    explained: dict[str, list[float]] = {"turned": [], "stationary": []}
+    for trial in range(trials):
+        rng = np.random.default_rng(500 + trial)
+        u = turning(rng, n)
+        along = np.sum(u * slow_noise(rng, n, 3), axis=1)
+        modes = SlowModes(u)
+        plain = colour_of(along[:, None])
+        if single:
+            excess = excess_of_one(modes, along, plain.white)
+        else:  # nine other values with the same noise, as the contrasts of four sensors are
+            excess = excess_of(colour_of(slow_noise(rng, n, 9)), modes.most)
+        turned = TurnedColour(modes, np.repeat(excess / plain.white, 3), Colour(None, 1.0))
+        turned = TurnedColour(modes, turned.variance, colour_of(turned.still(along)[:, None]))
+        trend = u * np.linspace(-1, 1, n)[:, None]
+        for name, colour in (("turned", turned), ("stationary", plain)):
+            a, r = colour.whiten(np.column_stack([trend, u])), colour.whiten(along)
+            a = a[:, :3] - a[:, 3:] @ np.linalg.lstsq(a[:, 3:], a[:, :3], rcond=None)[0]
+            explained[name].append(float(r @ a @ np.linalg.solve(a.T @ a, a.T @ r)))
+    assert np.mean(explained["stationary"]) > 30  # what it is about
+    # 3 with a standard error of 0.4 for 40 trials; the slowest mode's own power is known to a factor of its chi-square
+    assert np.mean(explained["turned"]) < (9.0 if single else 6.0)
+
+
+def test_a_thermometer_without_the_noise_of_its_log() -> None:
+    rng = np.random.default_rng(8)
+    n = 4000
+    true = 20.0 + np.cumsum(np.cumsum(rng.standard_normal(n))) * 1e-4
+    logged = true + 0.1 * rng.standard_normal(n)
+    assert np.std(quieted(logged) - true) < 0.25 * 0.1
+    np.testing.assert_allclose(quieted(true), true, atol=1e-3 * np.ptp(true))
+    rough = rng.standard_normal(n)  # nothing slow in it: what is logged may be what there is
+    np.testing.assert_array_equal(quieted(rough), rough)
+
+
+def two_unlike(seed: int, *effects: dict[str, Any]) -> dict[str, Any]:
+    """A good sensor and a bad one, as on a cheap payload, each with a noisy thermometer."""
+    instrument = {
+        "seed": 7,
+        "array": {"positions_m": [[0.1, 0.0, 0.0], [-0.1, 0.0, 0.0]]},
+        "errors": {"scale": 0.03, "non_orthogonality_deg": 1.0, "misalignment_deg": 3.0, "bias_nT": 1000.0},
+        "noise": {"white_sd_nT": [[10.0] * 3, [100.0] * 3]},
+    }
+    temperature = {
+        "type": "temperature", "per_sensor": True, "trend_degC_per_h": -20.0, "wander_rms_degC": 3.0,
+        "wander_time_s": 600.0, "self_heating_degC": 4.0, "tau_s": 240.0, "log_noise": 0.16,
+    }  # fmt: skip
+    motion = {"type": "tumbling", "duration_s": 3000.0, "rate_rms_deg_s": 15.0, "rate_time_s": 5.0}
+    return scenario(seed, *effects, instrument=instrument, channels={"temperature": temperature}, motion=motion)
+
+
+def test_a_strong_slow_effect_of_the_worse_of_two_sensors(tmp_path: Path) -> None:
+    """Thirteen times its noise; in noise of the residual's own colour next to nothing of it is left."""
+    coefficients = [[0.0, 0.0, 0.0], [-40.0, -330.0, 430.0]]
+    effect = {"type": "temperature_offset", "lag_s": 0.0, "reference_degC": 20.0, "nT_per_degC": coefficients}
+    found = verdict_of(tmp_path, two_unlike(2, effect))
+    assert adopted_names(found) == {"temperature_offset"}
+    value = {(c["sensor"], c["name"]): c["value"] for c in found["adopted"][0]["coefficients"]}
+    for axis, true in zip("xyz", coefficients[1], strict=True):
+        assert value["S2", axis] == pytest.approx(true, rel=0.03, abs=5.0)
+    # a lag of its own would be the noise of the log, smoothed
+    assert found["adopted"][0]["settings"]["lag_s"] < 5.0
+    before, after = (found["error"]["held_out"][k]["total_field_rms_nT"] for k in ("before", "after"))
+    assert after["S2"] < 120.0 < 0.1 * before["S2"]
+    assert after["S1"] < 1.1 * before["S1"]
+
+
+@pytest.mark.parametrize(
+    "noise", [{"flicker_nT_per_rtHz": 0.1}, {"flicker_nT_per_rtHz": 0.01, "flicker_exponent": 2.0}]
+)
+def test_strong_slow_noise_is_no_effect(tmp_path: Path, noise: dict[str, float]) -> None:
+    instrument = scenario()["instrument"] | {"noise": {"white_sd_nT": 0.15} | noise, "seed": 101}
+    found = verdict_of(tmp_path, scenario(101, instrument=instrument))
+    assert found["adopted"] == []
