@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -81,7 +82,9 @@ def block_count(samples: int) -> int:
     return int(np.clip(samples // LEAST_PER_BLOCK, 1, FINEST_BLOCKS))
 
 
-def assess(residual: Residual, terms: Terms, colours: Colours, given: Terms | None = None) -> Assessment:
+def assess(
+    residual: Residual, terms: Terms, colours: Colours, given: Terms | None = None, near: Colours | None = None
+) -> Assessment:
     """Assess terms that no model holds yet, the coefficients of the given ones being free as well.
 
     Two colours of noise are needed. A test of the null hypothesis uses the colour of the residual as it is: slow noise
@@ -94,6 +97,7 @@ def assess(residual: Residual, terms: Terms, colours: Colours, given: Terms | No
     terms: with the residual's samples as rows.
     colours: of the residual.
     given: terms of the current model, whose coefficients are fitted along.
+    near: the colour of what nearly the same terms leave, where it is known.
     """
     together = terms if given is None else joined([given, terms])
     first = together.count - terms.count
@@ -103,8 +107,7 @@ def assess(residual: Residual, terms: Terms, colours: Colours, given: Terms | No
     null = grams(residual, together, colours.across, colours.along, count)
     null_gain = held_out_gain(null, residual.freedom, blocked)
     null_p = _p_of(null, first)
-    starts = [colours] if _white(colours) else [colours, WHITE]
-    best = max((_likeliest(residual, together, start) for start in starts), key=lambda found: found.log_likelihood)
+    best = likeliest(residual, together, [colours, WHITE] if near is None else [near])
     now = best.colours
     blocks = grams(residual, together, now.across, now.along, count)
     n, y = normal(blocks.total())
@@ -123,22 +126,23 @@ class Likeliest:
     log_likelihood: float
 
 
-def _likeliest(residual: Residual, terms: Terms, colours: Colours) -> Likeliest:
-    """The likeliest coefficients and colour, found from a first guess of the colour.
+def likeliest(residual: Residual, terms: Terms, guesses: Sequence[Colours]) -> Likeliest:
+    """The likeliest coefficients and colour, found from first guesses of the colour.
 
     They depend on each other, and may agree in two ways: the terms explain what is slow, or the noise does and the
     terms follow its middle frequencies. Where one guess leads is not where another does, a law that fits the spectrum
     badly may lead away from both, and the likelihood says which to believe.
     """
     found: list[Likeliest] = []
-    for _ in range(_ROUNDS):
-        theta = estimated(residual, terms, colours).theta
-        left = taken_off(residual, terms, theta)
-        after = colours_of(left, stiff=True)
-        found.append(Likeliest(theta, after, log_likelihood(left, after)))
-        if _alike(after, colours):
-            break
-        colours = after
+    for colours in guesses:
+        for _ in range(_ROUNDS):
+            theta = estimated(residual, terms, colours).theta
+            left = taken_off(residual, terms, theta)
+            after = colours_of(left, stiff=True)
+            found.append(Likeliest(theta, after, log_likelihood(left, after)))
+            if _alike(after, colours):
+                break
+            colours = after
     return max(found, key=lambda each: each.log_likelihood)
 
 
@@ -188,10 +192,6 @@ def _alike(a: Colours, b: Colours) -> bool:
         np.isclose(x.white, y.white, rtol=1e-3) and 1 / 1.1 < x.lowest / y.lowest < 1.1
         for x, y in ((a.across, b.across), (a.along, b.along))
     )
-
-
-def _white(colours: Colours) -> bool:
-    return colours.across.power is None and isinstance(colours.along, Colour) and colours.along.power is None
 
 
 def contribution_rms(terms: Terms, theta: Array, outputs: int) -> Array:

@@ -18,6 +18,7 @@ from magtensor.loop.assessment import (
     colours_of,
     estimated_in,
     explained,
+    likeliest,
 )
 from magtensor.loop.evidence import Whitened
 from magtensor.loop.excitation import Excitation
@@ -117,14 +118,14 @@ def candidates_of(state: State, models: Sequence[Component], failed: dict[str, s
     looked_at = _shortlist(scored, lambda s: s.white) + _shortlist(scored, lambda s: s.coloured)
     assessed: dict[tuple[str, str], tuple[Adopted, float, Terms, Assessment]] = {}
     for each in looked_at:
-        settings = _refined(residual, each.model, each.settings, state, failed)
+        settings, near = _refined(residual, each.model, each.settings, state, failed)
         key = each.model.name, str(settings)
         if key in assessed:
             continue
         terms = _terms(each.model, settings, state.excitation, failed)
         assert terms is not None
         terms = terms.at(residual.samples)
-        assessment = assess(residual, terms, state.colours, state.terms)
+        assessment = assess(residual, terms, state.colours, state.terms, near)
         assessed[key] = Adopted(each.model, settings), each.tried, terms, assessment
     found = _one_each(list(assessed.values()))
     order = sorted(range(len(found)), key=lambda i: min(1.0, found[i][3].p * found[i][1]))
@@ -273,8 +274,12 @@ class Scorer:
 
 def _refined(
     residual: Residual, model: Component, settings: dict[str, Any], state: State, failed: dict[str, str]
-) -> dict[str, Any]:
-    """Settings on a range, moved between the neighbours of the best grid value by golden section."""
+) -> tuple[dict[str, Any], Colours | None]:
+    """Settings on a range, moved between the neighbours of the best grid value by golden section.
+
+    And the colour of what the model leaves, where it was needed.
+    """
+    near: Colours | None = None
     for name, grid in profiled(model).items():
         if not isinstance(grid, (Range, EventTimes)):
             continue
@@ -284,15 +289,17 @@ def _refined(
         terms = _terms(model, settings, state.excitation, failed)
         if terms is None or high <= low:
             continue
-        colours = assess(residual, terms.at(residual.samples), state.colours, state.terms).colours
-        score = Scorer(residual, state.terms, colours)
+        terms = terms.at(residual.samples)
+        together = terms if state.terms is None else joined([state.terms, terms])
+        near = likeliest(residual, together, [state.colours, WHITE]).colours
+        score = Scorer(residual, state.terms, near)
 
         def gain(value: float, name: str = name, score: Scorer = score, rest: dict[str, Any] = settings) -> float:
             found = _terms(model, {**rest, name: value}, state.excitation, failed)
             return -np.inf if found is None else score(found.at(residual.samples))
 
         settings = {**settings, name: golden(gain, low, high, settings[name])}
-    return settings
+    return settings, near
 
 
 def golden(f: Callable[[float], float], low: float, high: float, best: float) -> float:
