@@ -16,6 +16,7 @@ from magtensor.loop.assessment import Colours, colours_of, estimated, log_likeli
 from magtensor.loop.excitation import Excitation
 from magtensor.loop.residual import Residual, residual_of, taken_off
 from magtensor.loop.statistics import Estimate
+from magtensor.loop.stretches import borne_out
 from magtensor.loop.terms import Terms, joined
 
 _MOST_ROUNDS = 6
@@ -141,12 +142,15 @@ class Fitting:
         worst_error: accepted predicted error of |b|, a fraction of F.
         noise: (S, 3) nT or None.
         complete: whether what the fit leaves is noise; while effects are still being searched it is not.
+        searching: samples beyond all noise are believed where their neighbours agree (`stretches`): an effect may yet
+            explain them.
     """
 
     reference_noise: float = 0.0
     worst_error: float = 0.05
     noise: Array | None = None
     complete: bool = False
+    searching: bool = True
 
 
 def joint_state(
@@ -222,10 +226,18 @@ def _share(residual: Residual, terms: Terms, step: Array, colours: Colours) -> f
 
 def _fit(raw: Array, reference: Array | None, how: Fitting, keep: NDArray[np.bool_] | None) -> JointFit:
     assert reference is not None
-    return fit_joint(
-        raw, reference, noise=how.noise, reference_noise=how.reference_noise, worst_error=how.worst_error, keep=keep,
-        complete=how.complete,
-    )  # fmt: skip
+
+    def fitted(believed: NDArray[np.bool_] | None) -> JointFit:
+        return fit_joint(
+            raw, reference, noise=how.noise, reference_noise=how.reference_noise, worst_error=how.worst_error,
+            keep=believed, complete=how.complete,
+        )  # fmt: skip
+
+    fit = fitted(keep)
+    if keep is not None or fit.keep.all() or not how.searching:
+        return fit
+    more = borne_out(fit, raw, reference, how.reference_noise)
+    return fit if np.array_equal(more, fit.keep) else fitted(more)
 
 
 def require_determined(record: Record, state: State, how: Fitting) -> None:

@@ -133,7 +133,9 @@ def search(
         steps[-1] = replace(steps[-1], adopted=source.evidence)
         record, state, shared = source.record, source.after, None
         standing = trial(record, state, how)
-    return Search(first, state, tuple(steps), not_tested, failed, record, shared or sought(state, record))
+    # what nothing explains is a disturbance after all, and no part of the calibration
+    last = joint_state(record, state.adopted, replace(how, searching=False), state.theta, state.lines)
+    return Search(first, last, tuple(steps), not_tested, failed, record, shared or sought(last, record))
 
 
 @dataclass(frozen=True)

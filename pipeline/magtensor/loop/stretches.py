@@ -1,0 +1,43 @@
+"""Samples that a fit doubts and that their neighbours bear out: an effect without a model, not a spike.
+
+A strong effect that lasts (warming up, a thermoelectric current at switch-on) lies beyond all noise while it does.
+Left out as disturbed it would take the evidence for itself along. A spike stands alone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from magtensor.calibration.joint import JointFit
+from magtensor.calibration.joint_together import FALSE_REJECTION
+from magtensor.calibration.types import Array, Mask
+from magtensor.loop.residual import residual_of
+
+NEIGHBOURS = 5  # samples of a running median: what lasts for three of them is no spike
+
+
+def borne_out(fit: JointFit, raw: Array, total_field: Array, reference_noise: float = 0.0) -> Mask:
+    """(N,) the samples of a fit, and those it doubts that depart from their neighbours by no more than noise.
+
+    Parameters
+    ----------
+    raw: (N, S, 3) nT and total_field: (N,) nT, those the fit was made from.
+    """
+    from scipy.ndimage import median_filter
+    from scipy.stats import chi2
+
+    doubted = np.flatnonzero(~fit.keep)
+    every = residual_of(replace(fit, keep=np.ones_like(fit.keep)), raw, total_field, reference_noise)
+    good = np.ones(len(raw), dtype=bool)
+    given = [(every.across, every.freedom - 1), (every.along, 1)]
+    parts = [(p.reshape(len(raw), -1), freedom) for p, freedom in given if p is not None]
+    for values, freedom in parts:
+        apart = values - median_filter(values, size=(NEIGHBOURS, 1), mode="nearest")
+        square = np.sum(apart**2, axis=1)
+        limit = chi2.isf(FALSE_REJECTION / (len(raw) * len(parts)), freedom) / chi2.median(freedom)
+        good &= square <= limit * np.median(square)
+    out = np.array(fit.keep)
+    out[doubted] = good[doubted]
+    return out
