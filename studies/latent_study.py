@@ -24,7 +24,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 import yaml
-from loop_study import BASE, EFFECTS, MOTIONS, STAGES
+from loop_surveys import BASE, EFFECTS, MOTIONS, STAGES
 
 from magtensor.errors import MagtensorError
 from magtensor.loop.model import Fitting, Record

@@ -1,0 +1,107 @@
+"""The simulated surveys of the studies of the loop: an array, its field and channels, motions and effects."""
+
+from __future__ import annotations
+
+import copy
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from magtensor.loop.model import Record
+from magtensor.loop.record import record_of
+from magtensor.recipe.plan import plan
+from magtensor.recipe.source import parse_yaml
+from magtensor.runner import run
+from magtensor.session import empty_survey
+from magtensor.simulate import Simulated, write
+
+BASE: dict[str, Any] = {
+    "title": "study",
+    "seed": 1,
+    "start": "2026-03-21T09:00:00Z",
+    "rate_Hz": 2.0,
+    "instrument": {
+        "seed": 41,
+        "array": {"shape": "cross", "baseline_m": 0.5},
+        "errors": {"scale": 0.01, "non_orthogonality_deg": 0.5, "misalignment_deg": 1.0, "bias_nT": 100.0},
+        "noise": {"white_sd_nT": 0.15},
+    },
+    "field": {
+        "earth": {"total_field_nT": 49500.0, "inclination_deg": 66.0, "declination_deg": 4.0},
+        "variation": {"diurnal": {"amplitude_nT": [5.0, -20.0, 8.0]}, "irregular": {"rms_nT": 1.5, "time_s": 400.0}},
+    },
+    "base_station": {"rate_Hz": 0.5, "noise_sd_nT": 0.1, "resolution_nT": 0.01},
+    "channels": {
+        "temperature": {
+            "type": "temperature", "ambient_degC": 18.0, "trend_degC_per_h": 5.0, "wander_rms_degC": 1.0,
+            "wander_time_s": 400.0, "self_heating_degC": 4.0, "tau_s": 240.0, "log_noise": 0.02,
+        },
+        "current_heater": {"type": "switched", "levels": [0.0, 1.5], "mean_hold_s": 45.0, "log_noise": 0.005},
+        "supply_voltage": {
+            "type": "supply", "resistance_ohm": 0.2, "loads": ["current_heater"], "wander_rms_V": 0.1,
+            "log_noise": 0.001,
+        },
+        "encoder": {"type": "angle", "log_noise": 0.001},
+        "pressure": {"type": "smooth", "mean": 5.0, "rms": 1.0, "time_s": 100.0, "units": "hPa", "log_noise": 0.002},
+    },
+    "logging": {"attitude": True, "acceleration": True},
+}  # fmt: skip
+MOTIONS: dict[str, dict[str, Any]] = {
+    "tumbling": {"type": "tumbling", "duration_s": 1800.0, "rate_rms_deg_s": 20.0, "rate_time_s": 4.0},
+    "tilt 40": {"type": "limited_tilt", "duration_s": 1800.0, "tilt_deg": 40.0},
+    "postures": {"type": "postures", "random_count": 136, "rest_s": 10.0, "turn_s": 3.0, "average": True},
+}
+EFFECTS: dict[str, dict[str, Any]] = {
+    "temperature_offset": {"lag_s": 100.0},
+    "temperature_scale": {},
+    "temperature_rate": {},
+    "offset_drift": {},
+    "scale_drift": {},
+    "warm_up": {"tau_s": 300.0},
+    "current_field": {"channel": "current_heater"},
+    "supply_scale": {},
+    "supply_offset": {},
+    "nonlinearity_quadratic": {},
+    "nonlinearity_cubic": {},
+    "cross_field": {},
+    "hysteresis": {"half_width_nT": [4000.0]},
+    "offset_step": {"time_s": [800.0]},
+    "sampling_lag": {"per_axis": True},
+    "eddy_current": {},
+    "bandwidth": {},
+    "clock_drift": {},
+    "viscous_magnetisation": {},
+    "moving_part": {"position_m": [0.3, 0.2, -0.8]},
+    "periodic_interference": {"frequency_Hz": 49.7},
+    "frame_flexure": {},
+    "channel_response": {"channel": "pressure", "power": 2, "lag_s": 3.0},
+    "latent_source": {"waveform_of": {"type": "switched", "mean_hold_s": 70.0}},
+    "fixed_source": {"position_m": [4.0, 0.0, -1.0]},
+    "site_gradient": {},
+    "reference_scale": {},
+    "reference_clock": {},
+    "reference_step": {"time_s": [700.0]},
+    "passing_source": {"time_s": 900.0, "closest_m": [12.0, 0.0, 0.0], "velocity_m_s": [0.0, 0.5, 0.0]},
+}
+STAGES = "title: study\nstages: [load, {detrend_diurnal: {uncovered: mask}}]\n"
+
+WHITE_NT: float = BASE["instrument"]["noise"]["white_sd_nT"]
+
+
+def scenario(motion: str, flicker: float, seed: int, effect: str = "", amplitude: float = 0.0) -> dict[str, Any]:
+    """A survey with 1/f noise (nT/rtHz at 1 Hz) and an effect of so many times the white noise, none for ""."""
+    made = copy.deepcopy(BASE) | {"motion": MOTIONS[motion], "seed": seed, "truth": False}
+    made["instrument"]["seed"] = 40 + seed
+    made["instrument"]["noise"]["flicker_nT_per_rtHz"] = flicker
+    if effect:
+        made["effects"] = [{"type": effect, "rms_nT": amplitude * WHITE_NT} | EFFECTS[effect]]
+    return made
+
+
+def recorded(simulation: Simulated) -> Record:
+    """Its samples as the loop sees them: written to a file, read and prepared by the recipe's stages."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "survey.h5"
+        write(simulation, path)
+        planned = plan(parse_yaml(STAGES, "study"), survey=path)
+        return record_of(run(planned, empty_survey(planned)).survey)
