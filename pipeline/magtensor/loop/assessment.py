@@ -82,9 +82,7 @@ def block_count(samples: int) -> int:
     return int(np.clip(samples // LEAST_PER_BLOCK, 1, FINEST_BLOCKS))
 
 
-def assess(
-    residual: Residual, terms: Terms, colours: Colours, given: Terms | None = None, near: Colours | None = None
-) -> Assessment:
+def assess(residual: Residual, terms: Terms, colours: Colours, given: Terms | None = None) -> Assessment:
     """Assess terms that no model holds yet, the coefficients of the given ones being free as well.
 
     Two colours of noise are needed. A test of the null hypothesis uses the colour of the residual as it is: slow noise
@@ -97,7 +95,6 @@ def assess(
     terms: with the residual's samples as rows.
     colours: of the residual.
     given: terms of the current model, whose coefficients are fitted along.
-    near: the colour of what nearly the same terms leave, where it is known.
     """
     together = terms if given is None else joined([given, terms])
     first = together.count - terms.count
@@ -107,7 +104,7 @@ def assess(
     null = grams(residual, together, colours.across, colours.along, count)
     null_gain = held_out_gain(null, residual.freedom, blocked)
     null_p = _p_of(null, first)
-    best = likeliest(residual, together, [colours, WHITE] if near is None else [near])
+    best = likeliest(residual, together, [colours, WHITE])
     now = best.colours
     blocks = grams(residual, together, now.across, now.along, count)
     n, y = normal(blocks.total())

@@ -34,6 +34,7 @@ LEAST_REDUCTION = 1e-4  # of the held-out sum of squares: smaller is significant
 LOG_MARGIN = 1.5  # the noise of a log is known to some per cent, and a dozen coefficients gain a little by chance
 SCREENED = 8  # models looked at closely in each round
 SCREENING_SAMPLES = 2000  # settings are profiled on so many samples
+REFINING_SAMPLES = 6000  # and the best of them refined on so many
 _REFINEMENTS = 8
 
 
@@ -118,14 +119,14 @@ def candidates_of(state: State, models: Sequence[Component], failed: dict[str, s
     looked_at = _shortlist(scored, lambda s: s.white) + _shortlist(scored, lambda s: s.coloured)
     assessed: dict[tuple[str, str], tuple[Adopted, float, Terms, Assessment]] = {}
     for each in looked_at:
-        settings, near = _refined(residual, each.model, each.settings, state, failed)
+        settings = _refined(each.model, each.settings, state, failed)
         key = each.model.name, str(settings)
         if key in assessed:
             continue
         terms = _terms(each.model, settings, state.excitation, failed)
         assert terms is not None
         terms = terms.at(residual.samples)
-        assessment = assess(residual, terms, state.colours, state.terms, near)
+        assessment = assess(residual, terms, state.colours, state.terms)
         assessed[key] = Adopted(each.model, settings), each.tried, terms, assessment
     found = _one_each(list(assessed.values()))
     order = sorted(range(len(found)), key=lambda i: min(1.0, found[i][3].p * found[i][1]))
@@ -162,10 +163,7 @@ class _Thinned:
 
     @classmethod
     def of(cls, state: State) -> _Thinned:
-        count = len(state.residual.affine)
-        thin = np.arange(0, count, -(-count // SCREENING_SAMPLES))
-        residual = state.residual.smaller(thin)
-        given = None if state.terms is None else state.terms.at(thin)
+        residual, given = _thinned(state, SCREENING_SAMPLES)
         return cls(residual, Scorer(residual, given, WHITE), Scorer(residual, given, colours_of(residual)))
 
 
@@ -272,14 +270,9 @@ class Scorer:
         return (explained(estimate) - self.own - rank) / float(np.sqrt(2.0 * rank))
 
 
-def _refined(
-    residual: Residual, model: Component, settings: dict[str, Any], state: State, failed: dict[str, str]
-) -> tuple[dict[str, Any], Colours | None]:
-    """Settings on a range, moved between the neighbours of the best grid value by golden section.
-
-    And the colour of what the model leaves, where it was needed.
-    """
-    near: Colours | None = None
+def _refined(model: Component, settings: dict[str, Any], state: State, failed: dict[str, str]) -> dict[str, Any]:
+    """Settings on a range, moved between the neighbours of the best grid value by golden section."""
+    few = _thinned(state, REFINING_SAMPLES)
     for name, grid in profiled(model).items():
         if not isinstance(grid, (Range, EventTimes)):
             continue
@@ -289,17 +282,26 @@ def _refined(
         terms = _terms(model, settings, state.excitation, failed)
         if terms is None or high <= low:
             continue
+        residual, given = few
         terms = terms.at(residual.samples)
-        together = terms if state.terms is None else joined([state.terms, terms])
-        near = likeliest(residual, together, [state.colours, WHITE]).colours
-        score = Scorer(residual, state.terms, near)
+        together = terms if given is None else joined([given, terms])
+        score = Scorer(residual, given, likeliest(residual, together, [colours_of(residual), WHITE]).colours)
 
         def gain(value: float, name: str = name, score: Scorer = score, rest: dict[str, Any] = settings) -> float:
             found = _terms(model, {**rest, name: value}, state.excitation, failed)
-            return -np.inf if found is None else score(found.at(residual.samples))
+            return -np.inf if found is None else score(found.at(few[0].samples))
 
         settings = {**settings, name: golden(gain, low, high, settings[name])}
-    return settings, near
+    return settings
+
+
+def _thinned(state: State, most: int) -> tuple[Residual, Terms | None]:
+    """At most so many samples of a residual, evenly chosen, and the adopted terms there."""
+    count = len(state.residual.affine)
+    if count <= most:
+        return state.residual, state.terms
+    thin = np.arange(0, count, -(-count // most))
+    return state.residual.smaller(thin), None if state.terms is None else state.terms.at(thin)
 
 
 def golden(f: Callable[[float], float], low: float, high: float, best: float) -> float:

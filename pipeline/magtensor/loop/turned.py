@@ -16,7 +16,7 @@ import numpy as np
 from magtensor.calibration.types import Array
 from magtensor.loop.colour import Colour
 
-LEAST_EXCESS = 0.3  # of the white power: a mode with less is left to the stationary part
+LEAST_EXCESS = 1.0  # over the white power: a mode with less is left to the stationary part
 MOST_MODES = 100
 MOST_ENTRIES = 3e7
 LAWS = (1.0, 2.0)  # of the power over frequency, tried for a single sensor
