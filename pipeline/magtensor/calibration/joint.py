@@ -102,7 +102,7 @@ def fit_recording(
         chosen = chosen if among is None else among[chosen]
         try:
             part = Together(*selected(recording, chosen), np.cumsum(np.diff(chosen, prepend=-1) != 1))
-            begun = fit_together(part, noise=noise, reference_noise=reference_noise, judge=judge)
+            begun = fit_together(part, noise=noise, reference_noise=reference_noise, judge=judge, complete=complete)
             level = None if complete else _level(part, begun.plane, begun.scalar, begun.keep)
             if len(chosen) == count:
                 used = np.zeros(recording.count, dtype=bool)

@@ -40,7 +40,9 @@ class Found:
     keep: Mask
 
 
-def fit_together(part: Together, *, noise: Array | None, reference_noise: float, judge: bool) -> Found:
+def fit_together(
+    part: Together, *, noise: Array | None, reference_noise: float, judge: bool, complete: bool = True
+) -> Found:
     """The joint fit of samples; the parameters are those of `joint.fit_recording`.
 
     Raises
@@ -58,10 +60,10 @@ def fit_together(part: Together, *, noise: Array | None, reference_noise: float,
     two = sensors == 2 and noise is None and given is not None
     for round_ in range(20):
         plane = common_field(raw, given, keep)
-        scalar = _scalar(plane, part, keep, reference_noise)
+        scalar = _scalar(plane, part, keep, reference_noise, complete)
         if sensors == 1 and noise is None:
             # one sensor has no neighbour to find its noise by: the residual along the field is all there is
-            plane, scalar = _by_own_residual(plane, scalar, part, keep, reference_noise)
+            plane, scalar = _by_own_residual(plane, scalar, part, keep, reference_noise, complete)
         if two and given is not None and round_ < _TOLD_APART:
             given = _told_apart(given, unfolded(plane, scalar), raw, total_field)
             continue
@@ -111,23 +113,23 @@ def _limits(squares: tuple[Array, Array], freedom: int, samples: int) -> Limits:
     return Limits(*most)
 
 
-def _scalar(plane: CommonField, part: Together, keep: Mask, reference_noise: float) -> ScalarFit:
+def _scalar(plane: CommonField, part: Together, keep: Mask, reference_noise: float, complete: bool) -> ScalarFit:
     y = plane.coordinates(part.raw)
     try:
-        return fit_scalar(y[keep], part.total_field[keep], reference_noise)
+        return fit_scalar(y[keep], part.total_field[keep], reference_noise, complete)
     except DataError:
         require_coverage(coverage(part.raw[keep, 0], part.total_field[keep]))
         raise
 
 
 def _by_own_residual(
-    plane: CommonField, scalar: ScalarFit, part: Together, keep: Mask, reference_noise: float
+    plane: CommonField, scalar: ScalarFit, part: Together, keep: Mask, reference_noise: float, complete: bool
 ) -> tuple[CommonField, ScalarFit]:
     """Plane and fit of a single sensor whose noise is the one that its residual shows."""
     factor = float(np.sqrt(scalar.chi2))
     plane = common_field(part.raw, np.full((1, 3), float(plane.noise[0]) * factor), keep)
     if reference_noise > 0:
-        return plane, _scalar(plane, part, keep, reference_noise)
+        return plane, _scalar(plane, part, keep, reference_noise, complete)
     return plane, scalar.with_noise(factor)
 
 

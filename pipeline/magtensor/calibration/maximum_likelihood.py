@@ -171,7 +171,7 @@ def scores(seen: Along, total_field: Array) -> Scores:
     return Scores(len(r), float(r @ r), np.array([*change, *shift]), normal, moments)
 
 
-def fit_scalar(y: Array, total_field: Array, reference_noise: float = 0.0) -> ScalarFit:
+def fit_scalar(y: Array, total_field: Array, reference_noise: float = 0.0, complete: bool = True) -> ScalarFit:
     """Fit matrix and offset by maximum likelihood, started from the algebraic ellipsoid.
 
     Parameters
@@ -179,6 +179,8 @@ def fit_scalar(y: Array, total_field: Array, reference_noise: float = 0.0) -> Sc
     y: (N, 3), noise of unit variance on every coordinate.
     total_field: (N,) nT.
     reference_noise: nT, of the total field.
+    complete: the model holds all there is. Where it does not, a likelihood that an effect without a model has left
+        without a maximum is no refusal: the algebraic ellipsoid will do until the effect is known.
 
     Raises
     ------
@@ -194,7 +196,14 @@ def fit_scalar(y: Array, total_field: Array, reference_noise: float = 0.0) -> Sc
             total += scores(seen, total_field[part])
         return total
 
-    return minimised(upper(found.shape), found.offset, at)
+    matrix, offset = upper(found.shape), found.offset
+    try:
+        return minimised(matrix, offset, at)
+    except NotEnoughData:
+        if complete:
+            raise
+        begun = at(matrix, offset)
+        return ScalarFit(matrix, offset, begun.cost / max(begun.samples - 9, 1), begun)
 
 
 def _start(y: Array, total_field: Array) -> Ellipsoid:
@@ -220,7 +229,10 @@ def minimised(
     """
     here, damping = at(matrix, offset), 0.0
     for _ in range(most_iterations):
-        step, expected = scoring_step(here)
+        try:
+            step, expected = scoring_step(here)
+        except np.linalg.LinAlgError as error:
+            raise NotEnoughData("the samples leave a parameter of the scalar fit open", hint="add attitudes") from error
         chi2 = here.cost / max(here.samples - 9, 1)
         if expected < max(1e-8 * chi2, here.rounding):  # less than 1e-4 of the parameters' standard deviations
             return ScalarFit(matrix, offset, chi2, here)

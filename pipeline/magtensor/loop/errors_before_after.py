@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from magtensor.accuracy import error_block
 from magtensor.calibration.joint import nearest_frame
 from magtensor.calibration.types import Array
-from magtensor.errors import NotEnoughData
+from magtensor.errors import DataError, NotEnoughData
 from magtensor.loop.model import Adopted, Fitting, Record, excitation_of, joint_state, without
 from magtensor.tensor.assembly import least_squares_assembly
 
@@ -45,7 +45,7 @@ def held_out_error(
         try:
             # the whole record makes the regressors: a lag remembers what went on while the test samples were taken
             state = joint_state(record, adopted, how, start, keep=train)
-        except NotEnoughData:
+        except DataError:
             return None
         x = excitation_of(record, state.fit)
         raw, field = without(record, [a.terms(x) for a in adopted], state.theta)

@@ -20,6 +20,7 @@ from magtensor.loop.stretches import borne_out
 from magtensor.loop.terms import Terms, joined
 
 _MOST_ROUNDS = 6
+_SLACK = 4.0  # in the error accepted while an effect may yet turn out to cause most of it
 _SETTLED = 0.02  # of a standard deviation
 _SHARES = (1.0, 0.5, 0.1)  # of a step, tried in this order
 _LIKELIHOOD_ROUNDING = 0.5  # a spectrum fitted anew is not the same to the last digit
@@ -229,7 +230,8 @@ def _fit(raw: Array, reference: Array | None, how: Fitting, keep: NDArray[np.boo
 
     def fitted(believed: NDArray[np.bool_] | None) -> JointFit:
         return fit_joint(
-            raw, reference, noise=how.noise, reference_noise=how.reference_noise, worst_error=how.worst_error,
+            raw, reference, noise=how.noise, reference_noise=how.reference_noise,
+            worst_error=how.worst_error if how.complete else _SLACK * how.worst_error,
             keep=believed, complete=how.complete,
         )  # fmt: skip
 

@@ -183,7 +183,10 @@ def _first_kept(
 
 def _kept(record: Record, before: Trial, chosen: Candidate, how: Fitting) -> tuple[Trial | None, str]:
     """The fit with a model, on fewer sensors where it hurts one that it does not help; None, and why, if it fails."""
-    after = trial(record, _polished(record, _adopt(record, before.state, chosen, how), how), how)
+    try:
+        after = trial(record, _polished(record, _adopt(record, before.state, chosen, how), how), how)
+    except DataError as error:  # with coefficients that run away nothing is left to calibrate
+        return None, f"it cannot be fitted: {error.what.split(':')[0]}"
     hurt = before.hurt_by(after)
     if hurt:
         which = len(before.state.adopted)
