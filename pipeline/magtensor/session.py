@@ -311,6 +311,8 @@ def apply(
     target = output or survey.with_name(f"{survey.stem}.calibrated.nc")
     written = [target, *([save_calibration] if save_calibration else [])]
     refuse_overwriting(written, [survey, calibration])
+    if save_calibration is not None and save_calibration.resolve() == target.resolve():
+        raise UsageError(f"{target} cannot hold both the calibrated survey and the calibration: name two files")
     for file in written:
         require_writable(file.parent)
     if memory_GiB is not None and (refine_rotation or save_calibration is not None):

@@ -9,6 +9,8 @@ from magtensor.accuracy import error_block, figure
 from magtensor.survey.model import Survey
 
 SCHEMA = 1
+WORSE = 1.1  # times the error without the adopted effects
+DISAGREES = 3.0  # times the error on held-out blocks
 
 
 def verdict(survey: Survey, verify: dict[str, Any] | None = None) -> dict[str, Any]:
@@ -95,7 +97,24 @@ def sentence(outcome: dict[str, Any]) -> str:
     else:
         head = f"Calibrated with {model}; nothing is left that asks for another effect"
     tail = f"; unexplained: {left['description']}" if left["present"] else ""
-    return f"{head}: {told}{tail}."
+    return f"{head}: {told}{tail}{_disagreement(outcome)}."
+
+
+def _disagreement(outcome: dict[str, Any]) -> str:
+    """Words where the verification survey contradicts the calibration."""
+    verify, held_out = outcome["error"].get("verify"), outcome["error"].get("held_out")
+    if not verify or not held_out:
+        return ""
+    key = "total_field_rms_nT"
+    before, after, here = ((b or {}).get(key) or {} for b in (verify["before"], verify["after"], held_out["after"]))
+    known = [v is not None for v in (before.get("all"), after.get("all"), here.get("all"))]
+    if not all(known):
+        return ""
+    if after["all"] > WORSE * before["all"]:
+        return "; what was added makes the verification survey worse: it does not carry over"
+    if after["all"] > DISAGREES * here["all"]:
+        return "; the verification survey disagrees with the calibration: look for what changed between the two"
+    return ""
 
 
 def _judged(outcome: dict[str, Any]) -> tuple[str, dict[str, Any] | None, dict[str, Any] | None]:

@@ -13,6 +13,8 @@ from magtensor.loop.model import Adopted, Record, State, without
 from magtensor.loop.waveform import NAME, course_of
 from magtensor.tensor.geometry import array_design
 
+TONE = "periodic_interference"
+LEAST_CONTRAST = 1e-4  # of a tone's own power, between the sensors
 MOST_STEPS = 8
 SETTLED_NT = 1e-4
 
@@ -47,6 +49,7 @@ def corrected_raw(
     raw = record.raw
     if not own:
         return raw
+    own = [(a, _as_it_is_here(record, calibration, a, t) if a.name == TONE else t) for a, t in own]
     forward = np.linalg.inv(calibration.matrix)
     for _ in range(MOST_STEPS):
         b = calibration.apply(raw)
@@ -60,6 +63,33 @@ def corrected_raw(
         if moved < SETTLED_NT:
             break
     return raw
+
+
+def _as_it_is_here(record: Record, calibration: ArrayCalibration, model: Adopted, theta: Array) -> Array:
+    """Coefficients of a tone with the phase and strength it has on this survey; what one survey began with is another's
+    accident.
+
+    Found from the differences between the sensors, which no uniform field makes, by least squares over the tone as it
+    was and a quarter of a turn later. A single sensor, and a tone that all sensors see alike, leave it unknown, and
+    nothing is taken off.
+    """
+    usable: NDArray[np.bool_] = np.asarray(np.isfinite(record.raw).all(axis=(1, 2)))
+    raw = np.where(usable[:, None, None], record.raw, 0.0)
+    terms = model.terms(record.excitation(raw, raw))
+    half = len(theta) // 2  # cosines first, then sines
+    later = np.concatenate([theta[half:], -theta[:half]])
+
+    def contrast(outputs: Array) -> Array:
+        b = np.einsum("sij,nsj->nsi", calibration.matrix, outputs)
+        return (b - b.mean(axis=1, keepdims=True))[usable].ravel()
+
+    size = raw[0].size
+    both = np.column_stack([contrast(terms.contribution(t, size).reshape(raw.shape)) for t in (theta, later)])
+    if np.sum(both**2) <= LEAST_CONTRAST * usable.sum() * float(theta @ theta):
+        return np.zeros_like(theta)
+    own = np.linalg.lstsq(both, contrast(raw - calibration.offset), rcond=1e-6)[0]
+    out: Array = own[0] * theta + own[1] * later
+    return out
 
 
 def hidden_waveform(

@@ -257,7 +257,7 @@ def _terms(model: Component, settings: Mapping[str, Any], x: Excitation, failed:
 
 
 class Scorer:
-    """What terms explain beyond the adopted ones, less what as many random regressors would, in units of chance."""
+    """How unlikely it is that as many random regressors explain as much beyond the adopted terms: -log of chance."""
 
     def __init__(self, residual: Residual, adopted: Terms | None, colours: Colours) -> None:
         self.white, self.adopted = Whitened.of(residual, colours.across, colours.along), adopted
@@ -266,8 +266,20 @@ class Scorer:
     def __call__(self, terms: Terms) -> float:
         together = terms if self.adopted is None else joined([self.adopted, terms])
         estimate = estimated_in(self.white, together)
-        rank = max(min(estimate.rank, terms.count), 1)
-        return (explained(estimate) - self.own - rank) / float(np.sqrt(2.0 * rank))
+        return rarity(explained(estimate) - self.own, max(min(estimate.rank, terms.count), 1))
+
+
+def rarity(explained: float, rank: int) -> float:
+    """-log of the probability that chi-square with `rank` degrees of freedom exceeds a value, however small that is."""
+    from math import lgamma, log
+
+    from scipy.special import chdtrc
+
+    tail = float(chdtrc(rank, max(explained, 0.0)))
+    if tail > 1e-250:
+        return -log(tail)
+    half = explained / 2.0
+    return half - (rank / 2.0 - 1.0) * log(half) + lgamma(rank / 2.0)
 
 
 def _refined(model: Component, settings: dict[str, Any], state: State, failed: dict[str, str]) -> dict[str, Any]:
