@@ -62,8 +62,10 @@ def recovered(shape: str, size: float, samples: int) -> tuple[float, float, floa
         left.append(w @ w)
         claimed.append(np.trace(found.covariance))
         standardised.append(w @ np.linalg.solve(found.covariance, w) / 3)
-    return float(np.degrees(np.sqrt(np.mean(left)))), float(np.degrees(np.sqrt(np.mean(claimed)))), float(
-        np.mean(standardised)
+    return (
+        float(np.degrees(np.sqrt(np.mean(left)))),
+        float(np.degrees(np.sqrt(np.mean(claimed)))),
+        float(np.mean(standardised)),
     )
 
 

@@ -116,9 +116,7 @@ def refined(survey: Survey, calibration: ArrayCalibration, worst: float) -> tupl
 
 def in_short(found: CommonRotation) -> str:
     """`by attitude: turned by 10.2 deg, known to 0.011 deg`."""
-    return (
-        f"by {' and '.join(found.sources)}: turned by {np.degrees(found.angle):.3g} deg, known to {_known_to(found)}"
-    )
+    return f"by {' and '.join(found.sources)}: turned by {np.degrees(found.angle):.3g} deg, known to {_known_to(found)}"
 
 
 def _known_to(found: CommonRotation) -> str:

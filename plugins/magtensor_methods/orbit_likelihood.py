@@ -11,7 +11,7 @@ from pydantic import Field
 from magtensor import DataError, NotEnoughData, UsageError, method
 from magtensor.calibration.types import Array
 from magtensor.tensor.elements import METRIC, full, rotation_of_five
-from magtensor.tensor.excitation import quadric_excitation
+from magtensor.tensor.excitation import quadric_excitation, require_moving
 from magtensor.tensor.invariants import invariants
 from magtensor.tensor.orbit import shape_angle
 from magtensor.tensor.orbit_fit import (
@@ -45,9 +45,7 @@ SCALE_UNIDENTIFIED = (
     "the scale of the corrected tensor is unidentified: only that its invariants are constant was used; given is the "
     "factor that makes det H that of the prior, and the standard deviations do not hold its error"
 )
-SIGN_OF_THE_PRIOR = (
-    "det G vanishes to within the noise: no data tell H from -H; given is the sign of the prior"
-)
+SIGN_OF_THE_PRIOR = "det G vanishes to within the noise: no data tell H from -H; given is the sign of the prior"
 SIGNIFICANT = 4.0  # standard deviations
 NOISE_TWICE = 2.0  # with the fewest rotations allowed the quadric's own noise is uncertain by a quarter
 WORST_MISFIT = 0.03  # of C_T, beyond noise: a source known to a few per cent does no more
@@ -240,19 +238,7 @@ def _noise_of_moving(measured: Array, magnitude: float | None) -> float:
     """
     found = quadric_excitation(measured)
     size = magnitude or float(np.sqrt(np.mean(np.var(measured, axis=0) @ np.diag(METRIC))))
-    if size < 5 * found.noise_std:
-        raise NotEnoughData(
-            f"the tensor's magnitude, {size:.3g} nT/m, is too small against a noise of {found.noise_std:.3g} nT/m",
-            where="tensor",
-            hint="rotate nearer to the source",
-        )
-    if found.still:
-        raise NotEnoughData(
-            f"{found.still} of the 5 independent combinations of components do not change beyond noise",
-            where="tensor",
-            hint="rotation about a single axis is not enough, one part of the tensor stays the same: rotate about "
-            "all three axes",
-        )
+    require_moving(found, size)
     return found.noise_std
 
 
@@ -273,5 +259,3 @@ def _covariance(
     to[25:, 25:30] = -unit * matrix @ back
     out: Array = to @ covariance(found) @ to.T
     return out
-
-

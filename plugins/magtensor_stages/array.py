@@ -82,9 +82,7 @@ BESIDE_TENSOR = (
 def touched_by_assembly(options: Mapping[str, Any]) -> Declares:
     """A tensor that is required needs positions; one that is not may stay away."""
     if options.get("required", True):
-        return Declares(
-            (*CALIBRATED, "position"), ("total_field",), (*TENSOR, "calibration/noise_std"), BESIDE_TENSOR
-        )
+        return Declares((*CALIBRATED, "position"), ("total_field",), (*TENSOR, "calibration/noise_std"), BESIDE_TENSOR)
     return Declares(CALIBRATED, ("total_field", "position"), ("calibration/noise_std",), (*TENSOR, *BESIDE_TENSOR))
 
 

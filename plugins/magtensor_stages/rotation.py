@@ -41,9 +41,7 @@ def fix_rotation(
             "attitude where the survey has one, else the symmetry"
         ),
     ] = "auto",
-    sensor: Annotated[
-        str | None, Field(description="a sensor whose axes are the platform's by construction")
-    ] = None,
+    sensor: Annotated[str | None, Field(description="a sensor whose axes are the platform's by construction")] = None,
     sensor_axis: Annotated[
         Axis | None, Field(description="only this axis of that sensor is; the rotation about it stays open")
     ] = None,

@@ -75,9 +75,7 @@ def test_folder_names_differ_and_depend_on_no_order(paths, random):
     random.shuffle(shuffled)
     assert folder_names(shuffled, {}, ("batch.json",)) == names
     stems = [p.stem.casefold() for p in paths]
-    assert all(
-        names[p] == p.stem for p in paths if stems.count(p.stem.casefold()) == 1 and p.stem != "batch.json"
-    )
+    assert all(names[p] == p.stem for p in paths if stems.count(p.stem.casefold()) == 1 and p.stem != "batch.json")
 
 
 @given(PATHS, PATHS)

@@ -102,9 +102,7 @@ def tilted(rng: np.random.Generator, count: int, tilt_deg: float, dip_deg: float
 def li_grid() -> np.ndarray:
     """The field (5832, 3) nT in the platform at Li's orientations: 20 deg steps about z, x and y."""
     dip, declination = np.radians([60.0, -7.0])
-    earth = LI_FIELD * np.array(
-        [np.cos(dip) * np.cos(declination), np.cos(dip) * np.sin(declination), np.sin(dip)]
-    )
+    earth = LI_FIELD * np.array([np.cos(dip) * np.cos(declination), np.cos(dip) * np.sin(declination), np.sin(dip)])
     steps = np.radians(np.arange(0, 360, 20))
     return np.array([turn_y(b) @ (turn_x(a) @ (turn_z(g) @ earth)) for a in steps for b in steps for g in steps])
 

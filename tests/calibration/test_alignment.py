@@ -17,9 +17,7 @@ TURNS = [np.zeros(3), np.array([0.02, -0.03, 0.01]), np.array([-0.03, 0.02, 0.05
 
 
 def ideal(noise: float = 1.0) -> SensorCalibration:
-    return SensorCalibration(
-        np.eye(3), np.zeros(3), np.zeros((12, 12)), "polar", noise, {"noise_nT": noise}
-    )
+    return SensorCalibration(np.eye(3), np.zeros(3), np.zeros((12, 12)), "polar", noise, {"noise_nT": noise})
 
 
 def outputs(rng: np.random.Generator, unit: np.ndarray, noise: float, faults=None) -> np.ndarray:

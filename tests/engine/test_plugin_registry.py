@@ -150,8 +150,7 @@ def test_order_of_folders_and_files_changes_nothing(tmp_path):
 def test_imported_function_of_another_plugin_is_no_duplicate(folder):
     (folder / "builds_on.py").write_text(
         "from magtensor import stage\nfrom magtensor_stages import load, align\n"
-        "from magtensor_stages.load import load as l\n"
-        + STAGE.format(name="own").split("\n", 1)[1]
+        "from magtensor_stages.load import load as l\n" + STAGE.format(name="own").split("\n", 1)[1]
     )
     registry = Registry.load([folder])
     assert registry.problems == []

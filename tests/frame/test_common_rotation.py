@@ -115,9 +115,7 @@ def test_symmetry_reaches_the_figures_of_an_independent_study_and_its_own_bound(
         turn = Rotation.from_rotvec(0.2 * rng.normal(size=3)).as_matrix()
         b = (np.einsum("nij,sj->nsi", tensors, position) + EARTH) @ turn.T
         b += noise * rng.normal(size=b.shape)
-        found = common_rotation(
-            [symmetry(b, position, np.full((4, 3), noise), perfect(4))], perfect(4), worst=0.2
-        )
+        found = common_rotation([symmetry(b, position, np.full((4, 3), noise), perfect(4))], perfect(4), worst=0.2)
         errors.append(np.linalg.norm(Rotation.from_matrix(found.rotation @ turn).as_rotvec()))
         # the asymmetry of xy has twice the variance of an element and moves by G_z . w
         bounds.append(np.trace(2 * 6.0**2 * np.linalg.inv(tensors[:, 2].T @ tensors[:, 2])))

@@ -129,4 +129,3 @@ def calibration_error(b: NDArray[np.float64], truth: NDArray[np.float64]) -> tup
     difference = (turned - turned.mean(axis=1, keepdims=True)) - (truth - mean_true[:, None])
     common = turned.mean(axis=1) - mean_true
     return float(np.sqrt(np.mean(common**2))), float(np.sqrt(np.mean(difference**2)))
-

@@ -203,9 +203,9 @@ def test_apply_to_another_instrument(
 ) -> None:
     change(contents)
     target = tmp_path / "out.nc"
-    command(
-        "apply", finished / "calibration.nc", contents.write(tmp_path / "other.nc"), "--output", target
-    ).refused(r"other\.nc", message)
+    command("apply", finished / "calibration.nc", contents.write(tmp_path / "other.nc"), "--output", target).refused(
+        r"other\.nc", message
+    )
     assert not target.exists()
 
 

@@ -79,9 +79,7 @@ def test_refused(bench: Any, tmp_path: Path, sound_contents: Contents, name: str
 
 
 @pytest.mark.parametrize("recipe", ["chi", "li", "joint"])
-def test_survived(
-    bench: Any, tmp_path: Path, sound_contents: Contents, truth: np.ndarray, recipe: str
-) -> None:
+def test_survived(bench: Any, tmp_path: Path, sound_contents: Contents, truth: np.ndarray, recipe: str) -> None:
     """Empty and unreadable cells, a row cut short at the end, semicolons, a byte-order mark, Windows line ends."""
     lines = table(sound_contents)
     for change in (cell(40, 3, ""), cell(41, 3, "NaN"), cell(80, 5, "1e999")):

@@ -86,9 +86,7 @@ def test_an_effect_adds_its_rms_and_nothing_else(name: str, clean: Simulated) ->
     assert clean.reference is not None and survey.reference is not None
     if truth.kind == "reference":
         np.testing.assert_array_equal(survey.b_raw, clean.b_raw)
-        np.testing.assert_allclose(
-            survey.reference.total_field - clean.reference.total_field, truth.added, atol=1e-9
-        )
+        np.testing.assert_allclose(survey.reference.total_field - clean.reference.total_field, truth.added, atol=1e-9)
         during = (survey.reference.time >= 0) & (survey.reference.time <= 60.0)
         assert np.sqrt(np.mean(truth.added[during] ** 2)) == pytest.approx(2.5, rel=1e-4)
         return
@@ -103,18 +101,14 @@ def test_an_effect_adds_its_rms_and_nothing_else(name: str, clean: Simulated) ->
         np.testing.assert_array_equal(changed, 0.0)
 
 
-@pytest.mark.parametrize(
-    "name", ["sampling_lag", "hysteresis", "eddy_current", "temperature_offset", "bandwidth"]
-)
+@pytest.mark.parametrize("name", ["sampling_lag", "hysteresis", "eddy_current", "temperature_offset", "bandwidth"])
 def test_the_result_does_not_depend_on_the_chunk(name: str) -> None:
     case = surroundings() | {"effects": [{"type": name, "rms_nT": 2.5} | EVERY[name]]}
     np.testing.assert_array_equal(simulate(case, chunk=37).b_raw, simulate(case).b_raw)
 
 
 def test_effects_add_up() -> None:
-    both = [
-        {"type": n, "rms_nT": 2.5} | EVERY[n] for n in ("temperature_offset", "current_field", "sampling_lag")
-    ]
+    both = [{"type": n, "rms_nT": 2.5} | EVERY[n] for n in ("temperature_offset", "current_field", "sampling_lag")]
     survey = simulate(surroundings() | {"effects": both})
     alone = simulate(surroundings()).b_raw
     np.testing.assert_allclose(survey.b_raw - alone, sum(e.added for e in survey.truth.effects), atol=1e-9)
@@ -127,9 +121,7 @@ def test_two_effects_of_a_type_differ() -> None:
 
 
 def test_only_the_sensors_named_are_affected() -> None:
-    survey = simulate(
-        surroundings() | {"effects": [{"type": "hysteresis", "rms_nT": 1.0, "sensors": ["S2", "S4"]}]}
-    )
+    survey = simulate(surroundings() | {"effects": [{"type": "hysteresis", "rms_nT": 1.0, "sensors": ["S2", "S4"]}]})
     (truth,) = survey.truth.effects
     assert not truth.added[:, [0, 2]].any()
     assert np.sqrt(np.mean(truth.added[:, [1, 3]] ** 2)) == pytest.approx(1.0, rel=1e-6)
@@ -173,9 +165,7 @@ def test_slow_eddy_currents_follow_the_rate_of_change() -> None:
 
 def test_viscous_magnetisation_lags() -> None:
     t, start, omega = spinning()
-    waveform, _ = added(
-        "viscous_magnetisation", {"coupling": [(0.01 * np.eye(3)).tolist()], "tau_s": 2.0}, motion=SPIN
-    )
+    waveform, _ = added("viscous_magnetisation", {"coupling": [(0.01 * np.eye(3)).tolist()], "tau_s": 2.0}, motion=SPIN)
     settled = t > 40
     expected = (0.01 * start / (1 - 2j * omega) * np.exp(-1j * omega * t))[settled]
     np.testing.assert_allclose(waveform[settled, 1, 0] + 1j * waveform[settled, 1, 1], expected, atol=1e-3)
@@ -220,18 +210,14 @@ def test_hysteresis_loop_width() -> None:
     late = np.arange(600) > 300
     rising = late & (np.gradient(m) > 0) & (np.abs(m) < 0.1 * np.abs(start))
     falling = late & (np.gradient(m) < 0) & (np.abs(m) < 0.1 * np.abs(start))
-    assert waveform[falling, 0, 0].mean() - waveform[rising, 0, 0].mean() == pytest.approx(
-        2 * w * r, rel=1e-9
-    )
+    assert waveform[falling, 0, 0].mean() - waveform[rising, 0, 0].mean() == pytest.approx(2 * w * r, rel=1e-9)
     assert np.abs(waveform).max() <= w * r * (1 + 1e-12)
 
 
 def test_nonlinearity_at_full_scale() -> None:
     earth = {"earth": {"vector_nT": [30000.0, 0.0, -40000.0]}}
     still = {"type": "one_axis", "duration_s": 1.0, "rate_deg_s": 0.0}
-    square, _ = added(
-        "nonlinearity_quadratic", {"nT_at_full_scale": [1.0, 2.0, 3.0]}, field=earth, motion=still
-    )
+    square, _ = added("nonlinearity_quadratic", {"nT_at_full_scale": [1.0, 2.0, 3.0]}, field=earth, motion=still)
     np.testing.assert_allclose(square[0, 0], [0.36, 0.0, 3 * 0.64], atol=1e-12)
     cube, _ = added("nonlinearity_cubic", {"nT_at_full_scale": [1.0, 2.0, 3.0]}, field=earth, motion=still)
     np.testing.assert_allclose(cube[0, 0], [0.216, 0.0, -3 * 0.512], atol=1e-12)
@@ -250,9 +236,7 @@ def test_offsets_and_scales_follow_their_channels() -> None:
     np.testing.assert_allclose(offset[:, 3], course[:, None] * [2.0, 0.0, -1.0], atol=1e-12)
     scale, _ = added("channel_response", response | {"times_field": True}, channels={"pressure": ramp})
     np.testing.assert_allclose(scale[:, 3], 1e-6 * offset[:, 3] * survey.truth.b[:, 3], atol=1e-12)
-    warming = {
-        "temperature": {"type": "temperature", "ambient_degC": 20.0, "trend_degC_per_h": 60.0, "tau_s": 0.0}
-    }
+    warming = {"temperature": {"type": "temperature", "ambient_degC": 20.0, "trend_degC_per_h": 60.0, "tau_s": 0.0}}
     settings = {"ppm_per_degC": [20.0, 20.0, 20.0], "reference_degC": 20.0}
     gain, survey = added("temperature_scale", settings, channels=warming)
     np.testing.assert_allclose(gain[-1, 2], 20e-6 * 599 / 600 * survey.truth.b[-1, 2], rtol=1e-6)
@@ -286,9 +270,7 @@ def test_temperature_of_a_body_after_a_step() -> None:
     second_order = 5 * (1 - (8 * np.exp(-t / 8) - 4 * np.exp(-t / 4)) / (8 - 4))
     np.testing.assert_allclose(waveform[:, 0, 0], second_order, atol=0.02)
     # a sudden change drives the difference between skin and core
-    rate, _ = added(
-        "temperature_rate", {"nT_per_degC": [1.0, 1.0, 1.0], "tau_s": 4.0}, channels={"temperature": body}
-    )
+    rate, _ = added("temperature_rate", {"nT_per_degC": [1.0, 1.0, 1.0], "tau_s": 4.0}, channels={"temperature": body})
     np.testing.assert_allclose(rate[:, 0, 0], 5 * -np.expm1(-t / 8.0) - second_order, atol=0.03)
 
 
@@ -407,9 +389,7 @@ def test_drift_warm_up_and_steps() -> None:
     np.testing.assert_allclose(ageing[180], 5e-6 * survey.truth.b[180])
     settling, _ = added("warm_up", {"nT": [8.0, 0.0, 0.0], "tau_s": 100.0}, motion=hour, rate_Hz=0.1)
     np.testing.assert_allclose(settling[[0, 10], 0, 0], [8.0, 8.0 / np.e])
-    jump, _ = added(
-        "offset_step", {"nT": [2.0, 0.0, 0.0], "time_s": [100.0, 200.0]}, motion=hour, rate_Hz=0.1
-    )
+    jump, _ = added("offset_step", {"nT": [2.0, 0.0, 0.0], "time_s": [100.0, 200.0]}, motion=hour, rate_Hz=0.1)
     np.testing.assert_array_equal(jump[[9, 10, 19, 20, -1], 0, 0], [0, 2, 2, 4, 4])
 
 
@@ -444,9 +424,7 @@ def test_unlogged_channels_act_but_are_not_written() -> None:
         ),
     ],
 )
-def test_what_cannot_be_simulated_is_refused(
-    effect: dict[str, Any], sections: dict[str, Any], message: str
-) -> None:
+def test_what_cannot_be_simulated_is_refused(effect: dict[str, Any], sections: dict[str, Any], message: str) -> None:
     with pytest.raises(UsageError, match=message):
         simulate(scenario(**sections, effects=[effect]))
 
@@ -482,12 +460,8 @@ def test_the_base_stations_noise_step_and_gaps() -> None:
 
 
 def test_the_reference_sees_the_sites_variation_and_not_its_sources() -> None:
-    survey = simulate(
-        surroundings() | {"effects": [{"type": "fixed_source", "rms_nT": 50.0} | EVERY["fixed_source"]]}
-    )
+    survey = simulate(surroundings() | {"effects": [{"type": "fixed_source", "rms_nT": 50.0} | EVERY["fixed_source"]]})
     uniform = simulate(surroundings() | {"field": surroundings()["field"] | {"dipoles": []}})
     assert survey.reference is not None
     at_samples = np.isin(survey.reference.time, np.arange(0.0, 60.0))
-    np.testing.assert_allclose(
-        survey.reference.total_field[at_samples], uniform.truth.total_field[::10], atol=1e-6
-    )
+    np.testing.assert_allclose(survey.reference.total_field[at_samples], uniform.truth.total_field[::10], atol=1e-6)

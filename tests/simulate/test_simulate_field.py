@@ -16,9 +16,7 @@ from magtensor.simulate.sources import Dipole, UniformGradient, dipole_field, tr
 
 def test_dipole_on_and_off_axis() -> None:
     moment = np.array([0.0, 0.0, 1.0])
-    np.testing.assert_allclose(
-        dipole_field(moment, np.array([0.0, 0.0, 1.0])), [0, 0, 200.0]
-    )  # mu0 m / 2 pi r^3
+    np.testing.assert_allclose(dipole_field(moment, np.array([0.0, 0.0, 1.0])), [0, 0, 200.0])  # mu0 m / 2 pi r^3
     np.testing.assert_allclose(dipole_field(moment, np.array([2.0, 0.0, 0.0])), [0, 0, -12.5])
 
 
@@ -41,9 +39,7 @@ def test_gradient_is_symmetric_traceless_and_the_derivative_of_the_field(
     h = 1e-4
     for j in range(3):
         step = h * np.eye(3)[j]
-        difference = (source.field(t, (x + step)[:, None]) - source.field(t, (x - step)[:, None]))[:, 0] / (
-            2 * h
-        )
+        difference = (source.field(t, (x + step)[:, None]) - source.field(t, (x - step)[:, None]))[:, 0] / (2 * h)
         np.testing.assert_allclose(gradient[:, :, j], difference, rtol=1e-5, atol=1e-4)
 
 
@@ -69,13 +65,9 @@ def test_platform_field_is_the_world_field_seen_through_the_attitude() -> None:
 
 
 def near_dipoles() -> Simulated:
-    field = NOISELESS["field"] | {
-        "dipoles": [{"position_m": [2.0, 1.0, -1.5], "moment_Am2": [3.0, -20.0, 40.0]}]
-    }
+    field = NOISELESS["field"] | {"dipoles": [{"position_m": [2.0, 1.0, -1.5], "moment_Am2": [3.0, -20.0, 40.0]}]}
     return simulate(
-        scenario(
-            field=field, effects=[{"type": "site_gradient", "tensor_nT_per_m": [5.0, -8.0, 3.0, 1.0, 9.0]}]
-        )
+        scenario(field=field, effects=[{"type": "site_gradient", "tensor_nT_per_m": [5.0, -8.0, 3.0, 1.0, 9.0]}])
     )
 
 
@@ -101,16 +93,12 @@ def test_tensor_invariants_do_not_depend_on_the_attitude_at_a_fixed_centre() -> 
 
 
 def test_uniform_site_gradient_turns_with_the_platform() -> None:
-    survey = simulate(
-        scenario(effects=[{"type": "site_gradient", "tensor_nT_per_m": [10.0, 0.0, 0.0, -10.0, 0.0]}])
-    )
+    survey = simulate(scenario(effects=[{"type": "site_gradient", "tensor_nT_per_m": [10.0, 0.0, 0.0, -10.0, 0.0]}]))
     r = Rotation.from_quat(survey.truth.attitude).as_matrix()
     expected = np.swapaxes(r, 1, 2) @ np.diag([10.0, -10.0, 0.0]) @ r
     np.testing.assert_allclose(survey.truth.tensor, expected, atol=1e-10)
     # in a uniform gradient the differences across the array are exact
-    np.testing.assert_allclose(
-        (survey.truth.b[:, 0] - survey.truth.b[:, 2]) / 0.5, expected[:, :, 0], atol=1e-7
-    )
+    np.testing.assert_allclose((survey.truth.b[:, 0] - survey.truth.b[:, 2]) / 0.5, expected[:, :, 0], atol=1e-7)
 
 
 def test_diurnal_variation_peaks_at_noon() -> None:

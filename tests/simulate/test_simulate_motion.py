@@ -57,9 +57,7 @@ def test_tumbling_has_the_rate_asked_for_and_covers_the_sphere() -> None:
 
 def test_limited_tilt_stays_within_and_reaches_its_limit() -> None:
     tilt = built({"type": "limited_tilt", "duration_s": 1200.0, "tilt_deg": 20.0})
-    yaw, pitch, roll = (
-        Rotation.from_quat(tilt.attitude(np.arange(0, 1200.0, 0.1))).as_euler("ZYX", degrees=True).T
-    )
+    yaw, pitch, roll = Rotation.from_quat(tilt.attitude(np.arange(0, 1200.0, 0.1))).as_euler("ZYX", degrees=True).T
     for angle in (pitch, roll):
         assert 19.5 < np.abs(angle).max() <= 20.0 + 1e-9
         assert angle.min() < -19 and angle.max() > 19
@@ -81,15 +79,11 @@ def test_postures_rest_turn_and_number_themselves() -> None:
     np.testing.assert_allclose(quarter.as_rotvec(degrees=True), [[0, 0, 90]], atol=1e-9)
     fine = np.arange(20.0, 40.0, 1e-3)
     rate = motions.angular_rate(postures, fine)
-    assert (
-        np.abs(np.diff(rate, axis=0)).max() < 0.05
-    )  # rad/s within a millisecond: no kick at the ends of a turn
+    assert np.abs(np.diff(rate, axis=0)).max() < 0.05  # rad/s within a millisecond: no kick at the ends of a turn
 
 
 def test_postures_keep_within_a_tilt() -> None:
-    postures = built(
-        {"type": "postures", "random_count": 300, "tilt_deg": 25.0, "rest_s": 1.0, "turn_s": 1.0}
-    )
+    postures = built({"type": "postures", "random_count": 300, "tilt_deg": 25.0, "rest_s": 1.0, "turn_s": 1.0})
     up = matrices(postures.attitude(2.0 * np.arange(300) + 0.5))[:, 2, 2]
     lean = np.rad2deg(np.arccos(np.clip(up, -1, 1)))
     assert 23.5 < lean.max() <= 25.0 + 1e-6
@@ -127,9 +121,7 @@ def test_survey_lines_are_straight_parallel_and_joined_smoothly() -> None:
     for k in range(3):
         x = lines.origin(time[segment == k])
         assert len(x) == 100
-        np.testing.assert_allclose(
-            x[:, 1:], [[-2.0 * k, 1.5]] * 100, atol=1e-9
-        )  # heading east: the next line is south
+        np.testing.assert_allclose(x[:, 1:], [[-2.0 * k, 1.5]] * 100, atol=1e-9)  # heading east: the next line is south
         np.testing.assert_allclose(np.diff(x[:, 0]), 0.2 * (-1) ** k, atol=1e-9)
     speed = np.diff(lines.origin(np.arange(0, lines.duration_s, 1e-3)), axis=0) / 1e-3
     assert np.abs(np.diff(speed, axis=0)).max() < 0.05

@@ -28,9 +28,7 @@ def test_rotations_agree_with_scipy() -> None:
         Rotation.from_rotvec(vector).as_matrix(),
         atol=1e-14,
     )
-    np.testing.assert_allclose(
-        rotations.transform(rotations.matrices(q), vector), theirs.apply(vector), atol=1e-14
-    )
+    np.testing.assert_allclose(rotations.transform(rotations.matrices(q), vector), theirs.apply(vector), atol=1e-14)
     np.testing.assert_allclose(
         rotations.matrices(rotations.quaternions(theirs.as_matrix())), theirs.as_matrix(), atol=1e-14
     )
@@ -38,9 +36,7 @@ def test_rotations_agree_with_scipy() -> None:
 
 def test_small_rotations_lose_no_digits() -> None:
     tiny = np.array([[1e-9, -2e-9, 3e-9], [0.0, 0.0, 0.0], [1e-300, 0.0, 0.0]])
-    np.testing.assert_allclose(
-        rotations.logarithm(rotations.exponential(tiny)), tiny, rtol=1e-12, atol=1e-290
-    )
+    np.testing.assert_allclose(rotations.logarithm(rotations.exponential(tiny)), tiny, rtol=1e-12, atol=1e-290)
 
 
 @pytest.mark.parametrize("quarter", ["x", "y", "z"])
@@ -79,9 +75,7 @@ def test_low_pass_sinusoid(tau: float) -> None:
     x = low_pass(lambda t: np.cos(omega * t)[:, None], time, tau)[:, 0]
     gain = 1 / (1 + 1j * omega * tau)
     exact = (gain * np.exp(1j * omega * time)).real
-    settled = exact + (1.0 - gain.real) * np.exp(
-        -time / tau
-    )  # starts as if the input had rested at its first value
+    settled = exact + (1.0 - gain.real) * np.exp(-time / tau)  # starts as if the input had rested at its first value
     np.testing.assert_allclose(x, settled, atol=2e-7)
 
 

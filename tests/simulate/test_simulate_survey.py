@@ -68,9 +68,7 @@ def test_li_2018_before_calibration() -> None:
     survey = simulate(shipped("li2018"))
     assert survey.b_raw.shape == (5832, 4, 3)
     total = np.linalg.norm(survey.b_raw, axis=-1) - 55000.0
-    assert [rms(total[:, s]) for s in range(4)] == pytest.approx(
-        [6685.23, 6638.08, 6548.99, 4951.23], abs=0.03
-    )
+    assert [rms(total[:, s]) for s in range(4)] == pytest.approx([6685.23, 6638.08, 6548.99, 4951.23], abs=0.03)
     table = {"xx": 24411.4, "xy": 15523.2, "zx": 6791.5, "yx": 25222.8, "yy": 8000.2, "zy": 29176.6}
     assert raw_tensor_rms(survey) == pytest.approx(table, abs=0.15)
 
@@ -152,9 +150,7 @@ def test_file_is_the_canonical_layout(tmp_path: Path) -> None:
         effects = json.loads(file["truth"].attrs["effects"])
         assert [e["name"] for e in effects] == ["temperature_offset", "reference_step"]
         assert Scenario.model_validate_json(file["truth"].attrs["scenario"], strict=False) == survey.scenario
-        np.testing.assert_array_equal(
-            file["truth/effect_00_temperature_offset"][()], survey.truth.effects[0].added
-        )
+        np.testing.assert_array_equal(file["truth/effect_00_temperature_offset"][()], survey.truth.effects[0].added)
 
 
 def test_file_opens_with_xarray(tmp_path: Path) -> None:
@@ -170,9 +166,7 @@ def test_file_opens_with_xarray(tmp_path: Path) -> None:
     with xr.open_dataset(tmp_path / "survey.h5", engine="h5netcdf", group="reference") as reference:
         assert reference["total_field"].dims == ("time",)
         assert reference["time"].values[0] == np.datetime64("2026-03-21T07:59:00")
-    with xr.open_dataset(
-        tmp_path / "survey.h5", engine="h5netcdf", group="truth", decode_times=False
-    ) as truth:
+    with xr.open_dataset(tmp_path / "survey.h5", engine="h5netcdf", group="truth", decode_times=False) as truth:
         assert truth["tensor_true"].dims == ("time", "row", "column")
 
 
@@ -216,13 +210,9 @@ def test_the_chunk_leaves_the_bits_alone(chunk: int) -> None:
 
 
 def test_another_effect_leaves_the_noise_alone() -> None:
-    more = noisy() | {
-        "effects": [*noisy()["effects"], {"type": "warm_up", "nT": [1.0, 1.0, 1.0], "tau_s": 9.0}]
-    }
+    more = noisy() | {"effects": [*noisy()["effects"], {"type": "warm_up", "nT": [1.0, 1.0, 1.0], "tau_s": 9.0}]}
     survey = simulate(more)
-    np.testing.assert_allclose(
-        survey.b_raw - survey.truth.effects[-1].added, simulate(noisy()).b_raw, atol=1e-9
-    )
+    np.testing.assert_allclose(survey.b_raw - survey.truth.effects[-1].added, simulate(noisy()).b_raw, atol=1e-9)
 
 
 def test_postures_may_be_averaged() -> None:
@@ -264,9 +254,7 @@ def test_the_attitude_may_be_logged_with_an_error() -> None:
 )
 def test_shapes(shape: str, count: int) -> None:
     array = {"shape": shape, "baseline_m": 0.4}
-    position = simulate(
-        scenario(instrument={"array": array}, motion={"type": "tumbling", "duration_s": 1.0})
-    ).position
+    position = simulate(scenario(instrument={"array": array}, motion={"type": "tumbling", "duration_s": 1.0})).position
     assert position.shape == (count, 3)
     np.testing.assert_allclose(position.mean(axis=0), 0.0, atol=1e-15)
     distance = np.linalg.norm(position[:, None] - position[None], axis=-1)

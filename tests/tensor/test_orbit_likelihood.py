@@ -104,9 +104,7 @@ def test_gradient_of_the_likelihood_is_that_of_finite_differences():
     normal = normals(surface, found)
     off = np.einsum("nck,nc->nk", normal, found.residual).ravel()
     analytic = -2 * derivatives(surface, found, normal).T @ off
-    numeric = [
-        (feet(readings, surface.moved(e)).cost - feet(readings, surface.moved(-e)).cost) / 2e-5 for e in steps()
-    ]
+    numeric = [(feet(readings, surface.moved(e)).cost - feet(readings, surface.moved(-e)).cost) / 2e-5 for e in steps()]
     np.testing.assert_allclose(analytic, numeric, atol=1e-6 * np.abs(analytic).max())
 
 
@@ -115,8 +113,7 @@ def test_derivatives_of_the_residuals_are_those_of_finite_differences():
     found = feet(readings, surface)
     normal = normals(surface, found)
     moved = [
-        (feet(readings, surface.moved(e)).residual - feet(readings, surface.moved(-e)).residual) / 2e-5
-        for e in steps()
+        (feet(readings, surface.moved(e)).residual - feet(readings, surface.moved(-e)).residual) / 2e-5 for e in steps()
     ]
     numeric = np.stack([np.einsum("nck,nc->nk", normal, r).ravel() for r in moved], axis=1)
     np.testing.assert_allclose(-derivatives(surface, found, normal), numeric, atol=1e-6)
@@ -235,9 +232,7 @@ def test_the_maximum_is_found_from_far_away(known):
         g = dipole_components(height)
         for _ in range(5):
             gradiometer, truth = far_off(rng), rotated_components(g, rng, count)
-            found = orbit_likelihood(
-                full(gauss(gradiometer, truth, rng)), *(i1_and_i2(g) if known else (None, None))
-            )
+            found = orbit_likelihood(full(gauss(gradiometer, truth, rng)), *(i1_and_i2(g) if known else (None, None)))
             assert found.noise_std == pytest.approx(NOISE_STD, rel=0.35)
             assert len(found.verdict) == (1 if known else 2)
 

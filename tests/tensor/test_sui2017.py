@@ -119,9 +119,7 @@ def test_ranks_and_nullities(g, axis, by_i1, by_both, quadric, cubic):
     assert nullity(cubic_monomials(t)) == cubic
 
 
-@pytest.mark.parametrize(
-    "degrees, expected", [(0, 1), (5, 0.99999), (45, 0.974), (70, 0.724), (80, 0.426), (90, 0)]
-)
+@pytest.mark.parametrize("degrees, expected", [(0, 1), (5, 0.99999), (45, 0.974), (70, 0.724), (80, 0.426), (90, 0)])
 def test_determinant_of_a_dipole_off_its_axis(degrees, expected):
     side = np.cross(ON_AXIS, BROADSIDE)
     direction = np.cos(np.radians(degrees)) * ON_AXIS + np.sin(np.radians(degrees)) * side

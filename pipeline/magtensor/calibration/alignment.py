@@ -187,17 +187,13 @@ def handedness(target: Array, source: Array) -> Handedness:
     maps = {d: nearest_orthogonal(target.T @ source, d) for d in (1, -1)}
     rms = {d: float(np.sqrt(np.mean((target - source @ m.T) ** 2))) for d, m in maps.items()}
     better = min(rms.values())
-    thinnest = min(
-        float(np.sqrt(max(np.linalg.eigvalsh(x.T @ x)[0], 0.0) / len(x))) for x in (target, source)
-    )
+    thinnest = min(float(np.sqrt(max(np.linalg.eigvalsh(x.T @ x)[0], 0.0) / len(x))) for x in (target, source))
     size = float(np.sqrt(np.mean(target**2)))
     undetermined = thinnest < max(5 * better, 1e-6 * size)
     return Handedness(not undetermined and rms[-1] < rms[1] / 2, undetermined, maps[-1], rms[1], rms[-1])
 
 
-def align(
-    b: Array, calibrations: Sequence[SensorCalibration], reference: int, aligner: Aligner
-) -> ArrayCalibration:
+def align(b: Array, calibrations: Sequence[SensorCalibration], reference: int, aligner: Aligner) -> ArrayCalibration:
     """Turn every sensor into the frame of the reference sensor.
 
     Parameters
@@ -237,9 +233,7 @@ def align(
     rotation = np.array([a.rotation for a in found])
     offset = np.array([c.offset for c in calibrations])
     matrix = rotation @ np.array([c.matrix for c in calibrations])
-    require_agreement(
-        np.einsum("sij,nsj->nsi", rotation, b), np.linalg.norm(b[:, reference], axis=1)
-    )
+    require_agreement(np.einsum("sij,nsj->nsi", rotation, b), np.linalg.norm(b[:, reference], axis=1))
     planar = [s for s in range(sensors) if hands[s].undetermined and s != reference]
     unobservable = [COMMON_ROTATION]
     if planar:

@@ -130,9 +130,7 @@ def _noise(contrast: Array, platform: SensorCalibration, matrix: Array) -> Array
     return out
 
 
-def _covariance(
-    raw: Array, total_field: Array, platform: SensorCalibration, fits: list[LiFit], noise: Array
-) -> Array:
+def _covariance(raw: Array, total_field: Array, platform: SensorCalibration, fits: list[LiFit], noise: Array) -> Array:
     """Covariance (12 S, 12 S): every sensor's noise reaches every fit through the mean.
 
     The fit of sensor s is the regression of B on z = (m_s, 1), so the disturbance d_j of B_j - M (m_j - o) moves

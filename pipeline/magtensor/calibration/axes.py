@@ -57,8 +57,7 @@ def describe_axes(rotation: Array, sensor: str, reference: str) -> str:
             extra = f" and its {inverted[0]} axis is inverted" if inverted else ""
             return f"the {_listed(moved)} axes of {sensor} are swapped against {reference}{extra}"
     turned = ", ".join(
-        f"{_NAMES[int(np.argmax(np.abs(column)))]} along "
-        f"{'+' if column.sum() > 0 else '-'}{_NAMES[k]}"
+        f"{_NAMES[int(np.argmax(np.abs(column)))]} along {'+' if column.sum() > 0 else '-'}{_NAMES[k]}"
         for k, column in enumerate(nearest)
     )
     kind = "left-handed" if np.linalg.det(nearest) < 0 else "mounted turned"

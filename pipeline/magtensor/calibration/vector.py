@@ -177,9 +177,7 @@ def levenberg_marquardt(raw: Array, field: Array) -> LiFit:
     target = q.T @ field / unit
     closed = np.linalg.lstsq(triangle, target, rcond=None)[0]
     if np.linalg.det(closed[:3]) < 0:
-        raise DataError(
-            "the sensor mirrors the reference vector", hint="an axis is inverted or two axes are swapped"
-        )
+        raise DataError("the sensor mirrors the reference vector", hint="an axis is inverted or two axes are swapped")
     floor = float(np.linalg.norm(target - triangle @ closed)) + 1e-7 * float(np.linalg.norm(target))
     evaluations = 0
     for start in _starts(closed[:3].T):

@@ -14,7 +14,7 @@ import numpy as np
 from magtensor.calibration.types import Array
 from magtensor.errors import DataError, NotEnoughData
 
-from .calibration_errors import CalibrationErrors
+from .calibration_errors import CalibrationErrors, directions
 from .sources import TURNS, TWICE, Slope, edges_of, excess
 
 LEAST_SAMPLES = 10
@@ -121,10 +121,7 @@ def attitude(b: Array, to_world: Array, errors: CalibrationErrors, world: Array 
     """
     if len(b) < LEAST_SAMPLES:
         raise NotEnoughData(f"{len(b)} samples with an attitude cannot tell the common rotation")
-    mean = b.mean(axis=1)
-    size = np.linalg.norm(mean, axis=1)[:, None]
-    direction = mean / size
-    rows = np.column_stack([b.reshape(len(b), -1), np.ones(len(b))]) / size
+    direction, rows = directions(b)
     parts = edges_of(np.ones(len(b)))
     return Attitude(
         np.stack([np.einsum("nij,na->ija", to_world[p], direction[p]) for p in parts]),

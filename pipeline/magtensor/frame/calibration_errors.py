@@ -42,6 +42,18 @@ class CalibrationErrors:
         return np.concatenate([by_field, each[..., 3].sum(axis=1)[..., None]], axis=2)
 
 
+def directions(b: Array) -> tuple[Array, Array]:
+    """(N, 3) direction of the mean field, and (N, 3 S + 1) per field: what `CalibrationErrors.of_mean` acts on.
+
+    Parameters
+    ----------
+    b: (N, S, 3) nT.
+    """
+    mean = b.mean(axis=1)
+    size = np.linalg.norm(mean, axis=1)[:, None]
+    return mean / size, np.column_stack([b.reshape(len(b), -1), np.ones(len(b))]) / size
+
+
 def tilt(matrix: Array) -> Array:
     """(12 S, 3): how the parameters move when the calibrated fields of all sensors turn by a rotation vector."""
     out = np.zeros((len(matrix), PARAMETERS_PER_SENSOR, 3))

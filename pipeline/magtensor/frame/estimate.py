@@ -69,9 +69,7 @@ class CommonRotation:
         return float(chi2.sf(self.vector @ np.linalg.solve(self.covariance, self.vector), 3))
 
 
-def common_rotation(
-    sources: Sequence[Source], errors: CalibrationErrors, *, worst: float = WORST
-) -> CommonRotation:
+def common_rotation(sources: Sequence[Source], errors: CalibrationErrors, *, worst: float = WORST) -> CommonRotation:
     """Find the rotation into the platform's frame that all sources together determine.
 
     The minimum is sought from all right-angled turns of the prior frame (that of the calibration). Of minima that the

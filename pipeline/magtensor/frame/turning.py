@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from magtensor.calibration.types import Array
 from magtensor.errors import NotEnoughData
 
-from .calibration_errors import CalibrationErrors
+from .calibration_errors import CalibrationErrors, directions
 from .sources import TURNS, Slope, edges_of, excess
 
 LEAST_SAMPLES = 10
@@ -72,9 +72,7 @@ class Turning:
         return rotation.T @ self.axis, -np.einsum("kij,j->ki", TURNS, self.axis) @ rotation
 
 
-def turning(
-    b: Array, turn: NDArray[np.int_], axis: Array, errors: CalibrationErrors, name: str
-) -> Turning:
+def turning(b: Array, turn: NDArray[np.int_], axis: Array, errors: CalibrationErrors, name: str) -> Turning:
     """Read turns about one axis.
 
     Parameters
@@ -91,10 +89,7 @@ def turning(
     """
     if len(b) < LEAST_SAMPLES:
         raise NotEnoughData(f"{len(b)} samples of {name} cannot tell the axis")
-    mean = b.mean(axis=1)
-    size = np.linalg.norm(mean, axis=1)[:, None]
-    direction = mean / size
-    rows = np.column_stack([b.reshape(len(b), -1), np.ones(len(b))]) / size
+    direction, rows = directions(b)
     centred, means, radial = direction.copy(), [], []
     for number in np.unique(turn):
         at = turn == number

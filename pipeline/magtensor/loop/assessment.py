@@ -189,9 +189,3 @@ def _alike(a: Colours, b: Colours) -> bool:
         np.isclose(x.white, y.white, rtol=1e-3) and 1 / 1.1 < x.lowest / y.lowest < 1.1
         for x, y in ((a.across, b.across), (a.along, b.along))
     )
-
-
-def contribution_rms(terms: Terms, theta: Array, outputs: int) -> Array:
-    """(outputs,) nT rms that terms add to each raw output, their mean taken off (an offset would hold it)."""
-    out: Array = terms.contribution(theta, outputs).std(axis=0)
-    return out

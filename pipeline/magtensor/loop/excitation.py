@@ -68,9 +68,7 @@ class Excitation:
 
     def channels_like(self, pattern: str, without: tuple[str, ...] = ()) -> list[str]:
         """The logged channels whose names fit."""
-        return sorted(
-            n for n in self.logged if fnmatchcase(n, pattern) and not any(fnmatchcase(n, w) for w in without)
-        )
+        return sorted(n for n in self.logged if fnmatchcase(n, pattern) and not any(fnmatchcase(n, w) for w in without))
 
     def channel(self, name: str) -> Array:
         """A logged channel, (N,), (N, S) or (N, 3).

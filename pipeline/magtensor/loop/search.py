@@ -290,9 +290,7 @@ def _spare(state: State, which: int, sensors: tuple[str, ...]) -> bool:
 
     assert state.terms is not None
     part = _slices(state)[which]
-    kept = [
-        i for i, s in enumerate(state.terms.sensors) if not part.start <= i < part.stop or s in sensors or s == ""
-    ]
+    kept = [i for i, s in enumerate(state.terms.sensors) if not part.start <= i < part.stop or s in sensors or s == ""]
     back = put_back(state.residual, state.terms, np.concatenate(state.theta))
     every = estimated(back, state.terms, state.colours)
     fewer = estimated(back, state.terms.only(kept), state.colours)

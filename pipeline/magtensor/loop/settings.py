@@ -1,7 +1,7 @@
 """What an error model leaves open besides its coefficients: settings that are profiled over a range.
 
-    lag_s: Annotated[float, Range(0.0, 600.0)] = 0.0
-    channel: Annotated[str, AnyChannel("current_*")]
+lag_s: Annotated[float, Range(0.0, 600.0)] = 0.0
+channel: Annotated[str, AnyChannel("current_*")]
 """
 
 from __future__ import annotations

@@ -71,11 +71,6 @@ class TurnedColour:
     rest: Colour
 
     @property
-    def power(self) -> Array | None:
-        """Of the rest."""
-        return self.rest.power
-
-    @property
     def white(self) -> float:
         """The white level."""
         return self.rest.white

@@ -140,9 +140,7 @@ def _tensor_pictures(content: Content) -> list[Picture | Gap]:
         found.append(Gap("Trace and asymmetry", "The array's geometry measures none of them independently."))
     else:
         caption = "Zero for a true gradient tensor; what shows here is error, of whatever source."
-        found.append(
-            picture("Trace and asymmetry", caption, lambda: time_pictures.closure(time, units, values, names))
-        )
+        found.append(picture("Trace and asymmetry", caption, lambda: time_pictures.closure(time, units, values, names)))
     invariants = content.in_use("calibrated/invariants")
     if invariants is not None and invariants.ndim == 2:
         entries = content.names("calibrated/invariant") or [str(k) for k in range(invariants.shape[1])]
@@ -257,5 +255,3 @@ def _left_out(use: Arrays) -> str:
         return ""
     shown = len(use.sensors)
     return f" Of {shown + use.left_out} sensors the {shown} with the most left are shown."
-
-

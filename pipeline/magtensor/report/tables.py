@@ -150,9 +150,9 @@ def _noise_column(content: Content) -> list[tuple[str, Mapping[str, Any]]]:
     }
     if gain is not None:
         of = np.sqrt(np.einsum("rcsa,sa->rc", gain**2, noise**2))
-        block["tensor_rms_nT_per_m"] = {
-            name: of["xyz".index(name[0]), "xyz".index(name[1])] for name in COMPONENTS
-        } | {"all": _rms(of)}
+        block["tensor_rms_nT_per_m"] = {name: of["xyz".index(name[0]), "xyz".index(name[1])] for name in COMPONENTS} | {
+            "all": _rms(of)
+        }
     return [("noise alone", block)]
 
 

@@ -26,18 +26,12 @@ class BaseStationSpec(Spec):
     """What is known of the base station; what is not known goes under effects (reference_*)."""
 
     rate_Hz: float = Field(1.0, gt=0, description="readings per second, Hz")
-    first_s: float | None = Field(
-        None, description="time of its first reading, s since the start; null: 60 s before"
-    )
-    last_s: float | None = Field(
-        None, description="time after which it stops, s; null: 60 s after the survey"
-    )
+    first_s: float | None = Field(None, description="time of its first reading, s since the start; null: 60 s before")
+    last_s: float | None = Field(None, description="time after which it stops, s; null: 60 s after the survey")
     noise_sd_nT: float = Field(0.05, ge=0, description="standard deviation of a reading, nT")
     resolution_nT: float = Field(0.01, ge=0, description="step of a reading, nT; 0: none")
     difference_nT: float = Field(0.0, description="steady difference of the total field, base minus site, nT")
-    latency_s: float = Field(
-        0.0, ge=-3600, le=3600, description="known delay: time stamp minus time of measurement, s"
-    )
+    latency_s: float = Field(0.0, ge=-3600, le=3600, description="known delay: time stamp minus time of measurement, s")
     gaps: list[GapSpec] = Field(default=[], description="times without readings")
 
 
@@ -75,9 +69,7 @@ def read_base_station(
     first, last = reading_times(spec, duration_s)
     reach = VARIATION_REACH_S - MAX_CLOCK_ERROR_S - abs(spec.latency_s)
     if first < -reach or last > duration_s + reach:
-        raise UsageError(
-            f"base_station: readings up to {reach:g} s before and after the survey can be simulated"
-        )
+        raise UsageError(f"base_station: readings up to {reach:g} s before and after the survey can be simulated")
     stamp = first + np.arange(max(0, int(np.floor((last - first) * spec.rate_Hz + 1e-9)) + 1)) / spec.rate_Hz
     recorded = np.ones(len(stamp), dtype=bool)
     for gap in spec.gaps:

@@ -41,13 +41,9 @@ class TemperatureSpec(ChannelBase):
     trend_degC_per_h: float = Field(0.0, description="steady change of the ambient temperature, degC/h")
     wander_rms_degC: float = Field(0.0, ge=0, description="rms of its irregular change, degC")
     wander_time_s: float = Field(600.0, gt=0, description="correlation time of that, s")
-    steps: list[StepSpec] = Field(
-        default=[], description="sudden changes of the ambient temperature (sun, shade)"
-    )
+    steps: list[StepSpec] = Field(default=[], description="sudden changes of the ambient temperature (sun, shade)")
     self_heating_degC: float = Field(0.0, description="rise above ambient in the long run, degC")
-    start_heated: bool = Field(
-        False, description="true: heating has acted for long; false: switched on at the start"
-    )
+    start_heated: bool = Field(False, description="true: heating has acted for long; false: switched on at the start")
     tau_s: float = Field(300.0, ge=0, description="thermal time constant, s")
     per_sensor: bool = Field(False, description="true: one temperature for each sensor")
     spread: float = Field(
@@ -136,9 +132,7 @@ class Channel:
     units: str
 
 
-def _switched(
-    spec: SwitchedSpec, rng: np.random.Generator, span: tuple[float, float]
-) -> Callable[[Array], Array]:
+def _switched(spec: SwitchedSpec, rng: np.random.Generator, span: tuple[float, float]) -> Callable[[Array], Array]:
     """A step function; holds are exponential."""
     changes, levels = [span[0]], [int(rng.integers(len(spec.levels)))]
     while changes[-1] < span[1]:
@@ -184,9 +178,7 @@ def _at_any_instant(
         smooth = SmoothRandom(rng, span, spec.time_s, spec.rms, 1)
         return lambda t: spec.mean + smooth(t)[:, 0]
     if isinstance(spec, SineSpec):
-        return lambda t: (
-            spec.mean + spec.amplitude * np.sin(2 * np.pi * t / spec.period_s + np.deg2rad(spec.phase_deg))
-        )
+        return lambda t: spec.mean + spec.amplitude * np.sin(2 * np.pi * t / spec.period_s + np.deg2rad(spec.phase_deg))
     return lambda t: spec.start + spec.per_h * t / 3600
 
 
@@ -216,17 +208,13 @@ def one_channel(
         voltage = spec.voltage_V - spec.discharge_V_per_h * time / 3600 + wander(time)[:, 0]
         for load in spec.loads:
             if load not in currents:
-                raise UsageError(
-                    f"channels.{name}.loads: no channel {load!r}; known: {', '.join(currents) or 'none'}"
-                )
+                raise UsageError(f"channels.{name}.loads: no channel {load!r}; known: {', '.join(currents) or 'none'}")
             voltage = voltage - spec.resistance_ohm * currents[load].values
         return Channel(voltage, units_of(spec))
     return Channel(_at_any_instant(spec, rng, span)(time), units_of(spec))
 
 
-def build_channels(
-    specs: Mapping[str, ChannelSpec], seed: int, time: Array, sensors: int
-) -> dict[str, Channel]:
+def build_channels(specs: Mapping[str, ChannelSpec], seed: int, time: Array, sensors: int) -> dict[str, Channel]:
     """All channels of a scenario; supplies last, because they sag under the currents."""
     out: dict[str, Channel] = {}
     for name in sorted(specs, key=lambda n: isinstance(specs[n], SupplySpec)):

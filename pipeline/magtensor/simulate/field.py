@@ -42,9 +42,7 @@ class EarthSpec(Spec):
             return np.array(self.vector_nT)
         dip, east = np.deg2rad(float(self.inclination_deg or 0.0)), np.deg2rad(self.declination_deg)
         level = np.cos(dip)
-        return float(self.total_field_nT or 0.0) * np.array(
-            [level * np.sin(east), level * np.cos(east), -np.sin(dip)]
-        )
+        return float(self.total_field_nT or 0.0) * np.array([level * np.sin(east), level * np.cos(east), -np.sin(dip)])
 
 
 class DiurnalSpec(Spec):
@@ -59,9 +57,7 @@ class PulsationSpec(Spec):
 
     rms_nT: float = Field(ge=0, description="rms amplitude, nT")
     period_s: float = Field(gt=0, description="central period, s")
-    relative_width: float = Field(
-        0.2, gt=0, lt=1, description="standard deviation of the frequency over its mean"
-    )
+    relative_width: float = Field(0.2, gt=0, lt=1, description="standard deviation of the frequency over its mean")
     direction: Vector3 = Field(default=[0.2, 1.0, 0.3], description="polarisation: east, north, up")
 
 
@@ -101,9 +97,7 @@ class Variation:
             self.bands.append((frequency, phase, band.rms_nT * np.sqrt(2 / TONES) * direction))
         span = (-VARIATION_REACH_S, duration_s + VARIATION_REACH_S)
         self.irregular = (
-            SmoothRandom(rng, span, spec.irregular.time_s, spec.irregular.rms_nT, 3)
-            if spec.irregular
-            else None
+            SmoothRandom(rng, span, spec.irregular.time_s, spec.irregular.rms_nT, 3) if spec.irregular else None
         )
 
     def __call__(self, t: Array) -> Array:

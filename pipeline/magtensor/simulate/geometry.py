@@ -26,9 +26,7 @@ class ArraySpec(Spec):
     baseline_m: float | None = Field(
         None,
         gt=0,
-        description=(
-            "distance of two opposite sensors (cross, hexahedron) or of two neighbours (other shapes), m"
-        ),
+        description=("distance of two opposite sensors (cross, hexahedron) or of two neighbours (other shapes), m"),
     )
     positions_m: list[Vector3] | None = Field(
         None, min_length=1, description="position of each sensor in the platform frame, m; instead of a shape"

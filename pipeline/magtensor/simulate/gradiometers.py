@@ -52,9 +52,7 @@ class Gradiometers:
 
 def build_gradiometers(spec: GradiometersSpec, rng: np.random.Generator) -> Gradiometers:
     """Draw the errors."""
-    baseline_turn, sense_turn = (
-        _turned(np.deg2rad(spec.misalignment_deg) * rng.uniform(-1, 1, 3)) for _ in range(2)
-    )
+    baseline_turn, sense_turn = (_turned(np.deg2rad(spec.misalignment_deg) * rng.uniform(-1, 1, 3)) for _ in range(2))
     skew = np.deg2rad(spec.non_orthogonality_deg) * rng.uniform(-1, 1, 6)
     (alpha, beta, delta), (sense_alpha, sense_beta, sense_delta) = skew[:3], skew[3:]
     baseline = np.array([_x_row(alpha, beta, 1), _y_row(delta), [0.0, 0.0, 1.0]]) @ baseline_turn

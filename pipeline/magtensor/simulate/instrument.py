@@ -25,9 +25,7 @@ class ChiAngles(Spec):
 
     convention: Literal["chi2017"]
     psi_rad: float = Field(0.0, description="between the y axis and its ideal, in the yz plane, rad")
-    phi_rad: float = Field(
-        0.0, description="between the ideal x axis and the x axis's projection on the xy plane, rad"
-    )
+    phi_rad: float = Field(0.0, description="between the ideal x axis and the x axis's projection on the xy plane, rad")
     theta_rad: float = Field(0.0, description="between the x axis and the xy plane, rad")
     alpha_rad: float = Field(0.0, description="misalignment about z, rad")
     beta_rad: float = Field(0.0, description="misalignment about x, rad")
@@ -97,9 +95,7 @@ class SensorErrorsSpec(Spec):
         non_orthogonality, rotation = self.angles.matrices()
         sensing = np.diag(self.scale) @ non_orthogonality
         soft_iron = np.zeros((3, 3)) if self.soft_iron is None else np.array(self.soft_iron)
-        return sensing @ (np.eye(3) + soft_iron) @ rotation, sensing @ self.hard_iron_nT + np.array(
-            self.bias_nT
-        )
+        return sensing @ (np.eye(3) + soft_iron) @ rotation, sensing @ self.hard_iron_nT + np.array(self.bias_nT)
 
 
 class RandomErrorsSpec(Spec):
@@ -114,9 +110,7 @@ class RandomErrorsSpec(Spec):
 
     def drawn(self, rng: np.random.Generator) -> SensorErrorsSpec:
         """One sensor's errors."""
-        angles = rng.uniform(-1, 1, 6) * np.deg2rad(
-            [self.non_orthogonality_deg] * 3 + [self.misalignment_deg] * 3
-        )
+        angles = rng.uniform(-1, 1, 6) * np.deg2rad([self.non_orthogonality_deg] * 3 + [self.misalignment_deg] * 3)
         psi, phi, theta, alpha, beta, gamma = angles.tolist()
         return SensorErrorsSpec(
             scale=(1 + self.scale * rng.uniform(-1, 1, 3)).tolist(),
@@ -138,9 +132,7 @@ class RandomErrorsSpec(Spec):
 class InstrumentSpec(Spec):
     """The array and its sensors. Two scenarios with equal instrument sections have the same instrument."""
 
-    seed: int = Field(
-        0, ge=0, description="seed of everything that belongs to the instrument, random errors above all"
-    )
+    seed: int = Field(0, ge=0, description="seed of everything that belongs to the instrument, random errors above all")
     array: ArraySpec = Field(description="geometry")
     errors: RandomErrorsSpec | list[SensorErrorsSpec] = Field(
         default=[],
@@ -182,9 +174,7 @@ def build_instrument(spec: InstrumentSpec) -> Instrument:
     else:
         errors = list(spec.errors) or [SensorErrorsSpec()] * len(sensors)
         if len(errors) != len(sensors):
-            raise UsageError(
-                f"instrument.errors has {len(errors)} entries; the array has {len(sensors)} sensors"
-            )
+            raise UsageError(f"instrument.errors has {len(errors)} entries; the array has {len(sensors)} sensors")
     linear = [e.linear() for e in errors]
     return Instrument(
         sensors,

@@ -34,9 +34,7 @@ from magtensor.simulate.rotations import (
 )
 from magtensor.simulate.spec import Array
 
-MARGIN_S = (
-    60.0  # how far before and after the survey an attitude is defined: delays and clock errors reach there
-)
+MARGIN_S = 60.0  # how far before and after the survey an attitude is defined: delays and clock errors reach there
 NOT_RECORDED = -1
 # Passive rotation from east, north, up to north, east, down.
 ENU_TO_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
@@ -89,9 +87,7 @@ class Tumbling(_OnSite):
         self.step = min(spec.rate_time_s / 20, 0.05 / rms)
         self.rate = SmoothRandom(rng, (self._span[0] - 1, self._span[1] + 1), spec.rate_time_s, rms, 3)
         first = uniform_attitudes(rng, 1)
-        begins = self._span[0] + self.step * np.arange(
-            int(np.ceil((self._span[1] - self._span[0]) / self.step)) + 1
-        )
+        begins = self._span[0] + self.step * np.arange(int(np.ceil((self._span[1] - self._span[0]) / self.step)) + 1)
         turns = exponential(self._turn(begins, np.full(len(begins), self.step)))
         self.knots = cumulative(np.concatenate([first, turns]))
 
@@ -100,10 +96,7 @@ class Tumbling(_OnSite):
         one = self.rate(begin + (0.5 - np.sqrt(3) / 6) * length)
         two = self.rate(begin + (0.5 + np.sqrt(3) / 6) * length)
         bend = np.stack(
-            [
-                one[:, (i + 1) % 3] * two[:, (i + 2) % 3] - one[:, (i + 2) % 3] * two[:, (i + 1) % 3]
-                for i in range(3)
-            ],
+            [one[:, (i + 1) % 3] * two[:, (i + 2) % 3] - one[:, (i + 2) % 3] * two[:, (i + 1) % 3] for i in range(3)],
             axis=-1,
         )
         out: Array = (one + two) * (length / 2)[:, None] + bend * (np.sqrt(3) / 12 * length**2)[:, None]
@@ -136,9 +129,7 @@ class LimitedTilt(_OnSite):
         self.duration_s = spec.duration_s
         self.limit = np.deg2rad(spec.tilt_deg)
         self.phase = SmoothRandom(rng, self._span, spec.tilt_time_s, self.PHASE_RMS, 2)
-        yaw_rms = (
-            np.deg2rad(spec.yaw_rate_rms_deg_s) * spec.yaw_time_s * np.sqrt(SPLINE_POWER / SPLINE_SLOPE_POWER)
-        )
+        yaw_rms = np.deg2rad(spec.yaw_rate_rms_deg_s) * spec.yaw_time_s * np.sqrt(SPLINE_POWER / SPLINE_SLOPE_POWER)
         self.yaw = SmoothRandom(rng, self._span, spec.yaw_time_s, yaw_rms, 1)
 
     def attitude(self, t: Array) -> Array:
@@ -215,9 +206,7 @@ class Attitudes(_OnSite):
 
 def _from_angles(angles: Array, sequence: str, zero_frame: str) -> Array:
     """Attitudes (n, 4) from angles (3, n) rad about x, y, z: b_platform = R1 R2 R3 b_zero with passive matrices."""
-    world_to_platform = np.broadcast_to(
-        ENU_TO_NED if zero_frame == "NED" else np.eye(3), (angles.shape[1], 3, 3)
-    )
+    world_to_platform = np.broadcast_to(ENU_TO_NED if zero_frame == "NED" else np.eye(3), (angles.shape[1], 3, 3))
     for axis in reversed(sequence):
         world_to_platform = passive(axis, angles["xyz".index(axis)]) @ world_to_platform
     return quaternions(np.swapaxes(world_to_platform, -1, -2))

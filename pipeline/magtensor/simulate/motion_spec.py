@@ -47,9 +47,7 @@ class PosturesSpec(Spec):
         None,
         gt=0,
         le=180,
-        description=(
-            "largest angle between platform z and up in the random attitudes, deg; null: any attitude"
-        ),
+        description=("largest angle between platform z and up in the random attitudes, deg; null: any attitude"),
     )
     rest_s: float = Field(10.0, gt=0, description="rest in each attitude, s")
     turn_s: float = Field(5.0, gt=0, description="time to turn to the next attitude, s; not recorded")
@@ -71,8 +69,7 @@ class EulerGridSpec(Spec):
     sequence: Sequence3 = Field(
         "yxz",
         description=(
-            "order of the three rotations from the world to the platform frame, the last one first: yxz "
-            "means Ry Rx Rz"
+            "order of the three rotations from the world to the platform frame, the last one first: yxz means Ry Rx Rz"
         ),
     )
     zero_frame: Literal["ENU", "NED"] = Field(
@@ -93,15 +90,13 @@ class RandomAttitudesSpec(Spec):
     euler_limits_deg: Vector3 | None = Field(
         None,
         description=(
-            "null: uniform over all attitudes; else the angles about x, y, z are uniform within +- these "
-            "limits, deg"
+            "null: uniform over all attitudes; else the angles about x, y, z are uniform within +- these limits, deg"
         ),
     )
     sequence: Sequence3 = Field(
         "yxz",
         description=(
-            "order of the three rotations from the world to the platform frame, the last one first: yxz "
-            "means Ry Rx Rz"
+            "order of the three rotations from the world to the platform frame, the last one first: yxz means Ry Rx Rz"
         ),
     )
     zero_frame: Literal["ENU", "NED"] = Field(
@@ -116,9 +111,7 @@ class OneAxisSpec(Spec):
     duration_s: float = Field(gt=0, description="length of the survey, s")
     axis: Vector3 = Field(default=[0.0, 0.0, 1.0], description="axis in the platform frame")
     rate_deg_s: float = Field(10.0, description="angular rate, deg/s")
-    tilt_deg: Vector3 = Field(
-        default=[0.0, 0.0, 0.0], description="attitude at the start, as a rotation vector, deg"
-    )
+    tilt_deg: Vector3 = Field(default=[0.0, 0.0, 0.0], description="attitude at the start, as a rotation vector, deg")
 
 
 class SurveyLinesSpec(Spec):
@@ -137,13 +130,9 @@ class SurveyLinesSpec(Spec):
     turn_s: float = Field(10.0, gt=0, description="time of a turn, s; not recorded")
     turn_round: bool = Field(
         True,
-        description=(
-            "true: the platform's x axis follows the direction of travel; false: it keeps the first line's"
-        ),
+        description=("true: the platform's x axis follows the direction of travel; false: it keeps the first line's"),
     )
-    wobble_deg: float = Field(
-        2.0, ge=0, description="rms of roll, pitch and yaw about the line's direction, deg"
-    )
+    wobble_deg: float = Field(2.0, ge=0, description="rms of roll, pitch and yaw about the line's direction, deg")
     wobble_time_s: float = Field(2.0, gt=0, description="correlation time of that, s")
 
     @property
@@ -153,13 +142,7 @@ class SurveyLinesSpec(Spec):
 
 
 MotionSpec = Annotated[
-    TumblingSpec
-    | LimitedTiltSpec
-    | PosturesSpec
-    | EulerGridSpec
-    | RandomAttitudesSpec
-    | OneAxisSpec
-    | SurveyLinesSpec,
+    TumblingSpec | LimitedTiltSpec | PosturesSpec | EulerGridSpec | RandomAttitudesSpec | OneAxisSpec | SurveyLinesSpec,
     Field(discriminator="type"),
 ]
 

@@ -32,23 +32,20 @@ class NoiseSpec(Spec):
     white_sd_nT: Level = Field(
         0.0,
         description=(
-            "standard deviation of the white part at the sampling rate, nT: one number or x, y, z for each "
-            "sensor"
+            "standard deviation of the white part at the sampling rate, nT: one number or x, y, z for each sensor"
         ),
     )
     flicker_nT_per_rtHz: Level = Field(
         0.0,
         description=(
-            "amplitude spectral density of the 1/f part at 1 Hz, nT/sqrt(Hz): one number or x, y, z for "
-            "each sensor"
+            "amplitude spectral density of the 1/f part at 1 Hz, nT/sqrt(Hz): one number or x, y, z for each sensor"
         ),
     )
     flicker_exponent: float = Field(1.0, gt=0, le=2, description="exponent of the 1/f part's power spectrum")
     enters: Literal["output", "field"] = Field(
         "output",
         description=(
-            "output: added to the raw output; field: added to the field before the sensor's errors, as Li "
-            "2018 does"
+            "output: added to the raw output; field: added to the field before the sensor's errors, as Li 2018 does"
         ),
     )
 

@@ -55,9 +55,7 @@ def _scale(group: h5py.Group, name: str, values: Any, **attributes: str) -> None
     dataset.attrs.update(attributes)
 
 
-def _variable(
-    group: h5py.Group, name: str, values: Any, dims: tuple[str, ...], units: str, long_name: str
-) -> None:
+def _variable(group: h5py.Group, name: str, values: Any, dims: tuple[str, ...], units: str, long_name: str) -> None:
     """A variable whose dimensions are the scales of this group, or else of the root."""
     dataset = group.create_dataset(name, data=values)
     for i, dim in enumerate(dims):
@@ -72,15 +70,11 @@ def _write_survey(file: h5py.File, simulated: Simulated) -> None:
     file.attrs["Conventions"] = "CF-1.8"
     file.attrs["title"] = simulated.scenario.title
     file.attrs["source"] = f"simulated by magtensor {__version__}"
-    _scale(
-        file, "time", simulated.time, units=_time_units(simulated), standard_name="time", calendar="standard"
-    )
+    _scale(file, "time", simulated.time, units=_time_units(simulated), standard_name="time", calendar="standard")
     _scale(file, "sensor", simulated.sensors, long_name="sensor name")
     _scale(file, "axis", ["x", "y", "z"], long_name="axis of the sensor or of the platform frame")
     _variable(file, "b_raw", simulated.b_raw, ("time", "sensor", "axis"), "nT", "raw output of each axis")
-    _variable(
-        file, "position", simulated.position, ("sensor", "axis"), "m", "sensor centre in the platform frame"
-    )
+    _variable(file, "position", simulated.position, ("sensor", "axis"), "m", "sensor centre in the platform frame")
     if simulated.segment is not None:
         _variable(file, "segment", simulated.segment, ("time",), "1", "posture or line")
     if any("quaternion" in dims for _, dims, _ in simulated.channels.values()):
@@ -129,9 +123,7 @@ def _write_truth(file: h5py.File, simulated: Simulated) -> None:
         long_name="scalar last, platform to world (east, north, up)",
     )
     at = ("time", "sensor", "axis")
-    _variable(
-        group, "b_true", truth.b, at, "nT", "field at the stated sensor positions in the platform frame"
-    )
+    _variable(group, "b_true", truth.b, at, "nT", "field at the stated sensor positions in the platform frame")
     _variable(
         group,
         "tensor_true",
@@ -144,9 +136,7 @@ def _write_truth(file: h5py.File, simulated: Simulated) -> None:
     _variable(group, "centre", truth.centre, ("axis",), "m", "mean of the stated sensor positions")
     _variable(group, "matrix", truth.matrix, ("sensor", "row", "column"), "1", "C of m = C b + o")
     _variable(group, "offset", truth.offset, ("sensor", "axis"), "nT", "o of m = C b + o")
-    _variable(
-        group, "noise_sd", truth.noise_sd, ("sensor", "axis"), "nT", "standard deviation of the white noise"
-    )
+    _variable(group, "noise_sd", truth.noise_sd, ("sensor", "axis"), "nT", "standard deviation of the white noise")
     _variable(
         group,
         "attitude_true",

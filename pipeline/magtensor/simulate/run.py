@@ -90,9 +90,7 @@ class Simulated:
     truth: Truth
 
 
-def simulate(
-    scenario: Scenario | dict[str, Any] | str | os.PathLike[str], *, chunk: int = CHUNK
-) -> Simulated:
+def simulate(scenario: Scenario | dict[str, Any] | str | os.PathLike[str], *, chunk: int = CHUNK) -> Simulated:
     """Simulate a survey.
 
     Args:

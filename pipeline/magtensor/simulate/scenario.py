@@ -28,9 +28,7 @@ class LoggingSpec(Spec):
     """Attitude and inertial channels written to the survey."""
 
     attitude: bool = Field(False, description="write the attitude, as a quaternion")
-    attitude_noise_deg: float = Field(
-        0.0, ge=0, description="standard deviation of each component of its error, deg"
-    )
+    attitude_noise_deg: float = Field(0.0, ge=0, description="standard deviation of each component of its error, deg")
     angular_rate: bool = Field(False, description="write the angular rate")
     angular_rate_noise_rad_s: float = Field(0.0, ge=0, description="standard deviation of its noise, rad/s")
     acceleration: bool = Field(False, description="write the specific force")
@@ -56,9 +54,7 @@ class Scenario(Spec):
         default={}, description="further channels by name: temperature, current_<name>, ..."
     )
     logging: LoggingSpec = Field(default=LoggingSpec(), description="attitude and inertial channels")
-    effects: list[AnyEffect] = Field(
-        default=[], description="what goes wrong, by the names of the error models"
-    )
+    effects: list[AnyEffect] = Field(default=[], description="what goes wrong, by the names of the error models")
     truth: bool | Literal["effects"] = Field(
         True, description="write the true values into the group /truth; effects: with each effect's waveform"
     )

@@ -57,9 +57,7 @@ def dipole_gradient(moment: Array, r: Array) -> Array:
 class Dipole:
     """A dipole at rest, or moving steadily through `position` at `time_s`."""
 
-    def __init__(
-        self, position: Array, moment: Array, velocity: Array | None = None, time_s: float = 0.0
-    ) -> None:
+    def __init__(self, position: Array, moment: Array, velocity: Array | None = None, time_s: float = 0.0) -> None:
         self.position, self.moment, self.time_s = (
             np.asarray(position, float),
             np.asarray(moment, float),

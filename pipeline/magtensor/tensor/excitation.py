@@ -122,18 +122,16 @@ def _in_noise_units(monomials: Array, derivatives: Array) -> Array:
     return out
 
 
-def refuse_degenerate_quadric(found: Excitation, magnitude: float, triaxiality: float) -> None:
-    """NotEnoughData, with the likely reason, when I1 does not determine its 20 coefficients.
+def require_moving(found: Excitation, magnitude: float) -> None:
+    """NotEnoughData when the source is too weak, or when some combinations of components stay as they are.
 
     Parameters
     ----------
     magnitude : C_T of the source in nT/m.
-    triaxiality : |normalised determinant| of the source.
     """
     if magnitude < 5 * found.noise_std:
         raise NotEnoughData(
-            f"the tensor's magnitude, {magnitude:.3g} nT/m, is too small against a noise of "
-            f"{found.noise_std:.3g} nT/m",
+            f"the tensor's magnitude, {magnitude:.3g} nT/m, is too small against a noise of {found.noise_std:.3g} nT/m",
             where="tensor",
             hint="rotate nearer to the source",
         )
@@ -144,6 +142,17 @@ def refuse_degenerate_quadric(found: Excitation, magnitude: float, triaxiality: 
             hint="rotation about a single axis is not enough, one part of the tensor stays the same: rotate about "
             "all three axes",
         )
+
+
+def refuse_degenerate_quadric(found: Excitation, magnitude: float, triaxiality: float) -> None:
+    """NotEnoughData, with the likely reason, when I1 does not determine its 20 coefficients.
+
+    Parameters
+    ----------
+    magnitude : C_T of the source in nT/m.
+    triaxiality : |normalised determinant| of the source.
+    """
+    require_moving(found, magnitude)
     if found.weakest >= found.needed:
         return
     if triaxiality > 0.9:

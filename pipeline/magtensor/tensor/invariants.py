@@ -146,4 +146,3 @@ def _strength_variance(g: Array, covariance: Array) -> Array:
 def _square(slope: Array, covariance: Array) -> Array:
     out: Array = np.einsum("na,nab,nb->n", slope, covariance, slope)
     return out
-

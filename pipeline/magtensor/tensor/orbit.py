@@ -45,9 +45,7 @@ class Surface:
 
     def moved(self, step: Array) -> Surface:
         """After a change (31,) of the coefficients."""
-        return Surface(
-            self.mixing + step[:25].reshape(5, 5), self.offset + step[25:30], self.angle + float(step[30])
-        )
+        return Surface(self.mixing + step[:25].reshape(5, 5), self.offset + step[25:30], self.angle + float(step[30]))
 
     def gauge(self) -> Array:
         """(3, 31): the change of the coefficients that turns all tensors about x, y, z and moves no reading."""

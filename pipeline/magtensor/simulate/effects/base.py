@@ -8,6 +8,7 @@ that the effect has the rms asked for.
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Literal
@@ -152,8 +153,7 @@ class EffectSpec(Spec):
         None,
         gt=0,
         description=(
-            "scale the coefficients so that the effect has this rms over samples, axes and affected "
-            "sensors, nT"
+            "scale the coefficients so that the effect has this rms over samples, axes and affected sensors, nT"
         ),
     )
 
@@ -177,9 +177,7 @@ class EffectSpec(Spec):
 class SensorEffectSpec(EffectSpec):
     """An effect on the raw output of the sensors."""
 
-    sensors: list[str] | None = Field(
-        None, min_length=1, description="names of the sensors it acts on; all where null"
-    )
+    sensors: list[str] | None = Field(None, min_length=1, description="names of the sensors it acts on; all where null")
 
     def drawn(self, bench: Bench, rng: np.random.Generator) -> Array:
         """Coefficients of random size and sign; (S, 3) unless overridden."""
@@ -189,9 +187,9 @@ class SensorEffectSpec(EffectSpec):
         """Coefficients as given; one vector for all sensors, or one for each, unless overridden."""
         return per_sensor(self.given, bench.sensors, f"effect {self.name}: {self.COEFFICIENTS}")
 
+    @abstractmethod
     def waveform(self, bench: Bench, coefficients: Array) -> Array:
         """What it adds to the raw output, (N, S, 3) nT."""
-        raise NotImplementedError
 
 
 def stop_if_jumping(effect: EffectSpec, bench: Bench) -> None:
@@ -206,15 +204,11 @@ def stop_if_jumping(effect: EffectSpec, bench: Bench) -> None:
 def scaled_to(effect: EffectSpec, rms: float, target: float) -> float:
     """target / rms, or a clear refusal where the effect does nothing on this survey."""
     if not rms > 0:
-        raise UsageError(
-            f"effect {effect.name} adds nothing on this survey, so it cannot be scaled to rms_nT"
-        )
+        raise UsageError(f"effect {effect.name} adds nothing on this survey, so it cannot be scaled to rms_nT")
     return target / rms
 
 
-def sensor_effect(
-    spec: SensorEffectSpec, number: int, instrument_seed: int, bench: Bench
-) -> tuple[EffectTruth, Array]:
+def sensor_effect(spec: SensorEffectSpec, number: int, instrument_seed: int, bench: Bench) -> tuple[EffectTruth, Array]:
     """Evaluate one effect.
 
     Args:
@@ -264,6 +258,4 @@ def rms_of(added: Array, kept: np.ndarray, sensors: int) -> float:
 def truth_of(spec: EffectSpec, rms: float, sensors: list[str], values: Array) -> EffectTruth:
     """The record of an effect with the coefficients it ended up with."""
     settings = spec.model_dump(exclude={"type", "rms_nT", "sensors", spec.COEFFICIENTS})
-    return EffectTruth(
-        spec.name, spec.KIND, rms, sensors, settings, {spec.COEFFICIENTS: np.asarray(values).tolist()}
-    )
+    return EffectTruth(spec.name, spec.KIND, rms, sensors, settings, {spec.COEFFICIENTS: np.asarray(values).tolist()})

@@ -25,9 +25,7 @@ class TemperatureOffset(SensorEffectSpec):
     nT_per_degC: PerSensor | None = Field(None, description="x, y, z, for all sensors or for each")
     channel: str = Field("temperature", description="temperature channel")
     lag_s: float = Field(0.0, ge=0, description="thermal time constant between the channel and the sensor, s")
-    reference_degC: float | None = Field(
-        None, description="temperature at which it is nil; null: the survey's mean"
-    )
+    reference_degC: float | None = Field(None, description="temperature at which it is nil; null: the survey's mean")
 
     def waveform(self, bench: Bench, coefficients: Array) -> Array:
         inside = bench.lagged_channel(self.channel, self.lag_s, self.name)
@@ -42,9 +40,7 @@ class TemperatureScale(SensorEffectSpec):
     ppm_per_degC: PerSensor | None = Field(None, description="x, y, z, for all sensors or for each")
     channel: str = Field("temperature", description="temperature channel")
     lag_s: float = Field(0.0, ge=0, description="thermal time constant between the channel and the sensor, s")
-    reference_degC: float | None = Field(
-        None, description="temperature at which it is nil; null: the survey's mean"
-    )
+    reference_degC: float | None = Field(None, description="temperature at which it is nil; null: the survey's mean")
 
     def waveform(self, bench: Bench, coefficients: Array) -> Array:
         inside = bench.lagged_channel(self.channel, self.lag_s, self.name)

@@ -34,9 +34,7 @@ class CurrentField(SensorEffectSpec):
     nT_per_A: PerSensor | None = Field(
         None, description="field in the platform frame, x, y, z, for all sensors or for each"
     )
-    loop: LoopSpec | None = Field(
-        None, description="a current loop from which the field follows, instead of nT_per_A"
-    )
+    loop: LoopSpec | None = Field(None, description="a current loop from which the field follows, instead of nT_per_A")
     channel: str = Field(description="current channel")
     lag_s: float = Field(0.0, ge=0, description="time constant of the current behind the logged one, s")
 
@@ -76,19 +74,13 @@ class ChannelResponse(SensorEffectSpec):
     power: Literal[1, 2, 3] = Field(1, description="power of the channel")
     lag_s: float = Field(0.0, ge=0, description="time constant behind the channel, s")
     times_field: bool = Field(False, description="true: multiplies the sensed field instead of adding to it")
-    reference: float | None = Field(
-        None, description="channel value at which it is nil; null: the survey's mean"
-    )
+    reference: float | None = Field(None, description="channel value at which it is nil; null: the survey's mean")
 
     def waveform(self, bench: Bench, coefficients: Array) -> Array:
         values = bench.lagged_channel(self.channel, self.lag_s, self.name)
         zero = bench.kept_mean(values) if self.reference is None else self.reference
         course = ((values - zero) ** self.power)[..., None]
-        return (
-            bench.sensed(bench.b) * (1e-6 * coefficients) * course
-            if self.times_field
-            else course * coefficients
-        )
+        return bench.sensed(bench.b) * (1e-6 * coefficients) * course if self.times_field else course * coefficients
 
 
 class LatentSource(SensorEffectSpec):
@@ -141,8 +133,7 @@ class PeriodicInterference(SensorEffectSpec):
     amplitude_nT: PerSensor | None = Field(
         None,
         description=(
-            "amplitude of the fundamental in the platform frame, for all sensors or for each; phases are "
-            "random"
+            "amplitude of the fundamental in the platform frame, for all sensors or for each; phases are random"
         ),
     )
     frequency_Hz: float = Field(gt=0, description="true frequency, Hz")
@@ -262,9 +253,7 @@ class FrameFlexure(SensorEffectSpec):
 def _matrices(given: object, sensors: int, what: str) -> Array:
     array = np.asarray(given, dtype=float)
     if len(array) not in (1, sensors):
-        raise UsageError(
-            f"{what} has {len(array)} matrices; the array has {sensors} sensors (give one, or {sensors})"
-        )
+        raise UsageError(f"{what} has {len(array)} matrices; the array has {sensors} sensors (give one, or {sensors})")
     return np.broadcast_to(array, (sensors, 3, 3)).copy()
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Callable
 from typing import ClassVar, Literal
 
@@ -27,9 +28,9 @@ class ReferenceEffectSpec(EffectSpec):
         """Coefficients as given, or of unit size."""
         return np.asarray(1.0 if self.given is None else self.given, dtype=float)
 
+    @abstractmethod
     def waveform(self, total_field: TotalField, stamp: Array, coefficients: Array) -> Array:
         """What it adds to the reference at its time stamps (M,) s, nT."""
-        raise NotImplementedError
 
 
 class ReferenceScale(ReferenceEffectSpec):

@@ -68,9 +68,7 @@ class Hysteresis(SensorEffectSpec):
     COEFFICIENTS = "weight"
     DYNAMIC = True
     type: Literal["hysteresis"]
-    weight: PerSensor | None = Field(
-        None, description="w of x, y, z, without dimension, for all sensors or for each"
-    )
+    weight: PerSensor | None = Field(None, description="w of x, y, z, without dimension, for all sensors or for each")
     half_width_nT: list[float] = Field(
         default=[5000.0], min_length=1, description="half widths r of the play operators, nT"
     )
@@ -98,9 +96,7 @@ class Bandwidth(SensorEffectSpec):
     DYNAMIC = True
     LINEAR = False
     type: Literal["bandwidth"]
-    tau_s: PerSensor | None = Field(
-        None, description="time constants of x, y, z, s, for all sensors or for each"
-    )
+    tau_s: PerSensor | None = Field(None, description="time constants of x, y, z, s, for all sensors or for each")
 
     def drawn(self, bench: Bench, rng: np.random.Generator) -> Array:
         return 1e-3 * np.abs(rng.standard_normal((bench.sensors, 3)))

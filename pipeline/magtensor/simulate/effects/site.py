@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from typing import ClassVar, Literal
 
 import numpy as np
@@ -17,9 +18,9 @@ class SiteEffectSpec(EffectSpec):
 
     KIND: ClassVar[Kind] = "site"
 
+    @abstractmethod
     def source(self, coefficients: Array) -> Source:
         """The source, proportional to its coefficients."""
-        raise NotImplementedError
 
 
 class FixedSource(SiteEffectSpec):

@@ -21,8 +21,7 @@ def _sampled_at(bench: Bench, shift: Array, effect: str) -> Array:
     """
     if not np.abs(shift).max() < MARGIN_S - 1:
         raise UsageError(
-            f"effect {effect}: a time error of {np.abs(shift).max():.3g} s; up to {MARGIN_S - 1:g} s "
-            f"can be simulated"
+            f"effect {effect}: a time error of {np.abs(shift).max():.3g} s; up to {MARGIN_S - 1:g} s can be simulated"
         )
     added = np.empty(bench.b.shape)
     for s in range(bench.sensors):
@@ -46,9 +45,7 @@ class SamplingLag(SensorEffectSpec):
     lag_s: PerSensor | None = Field(
         None, description="delays of x, y, z behind the time stamp, s, for all sensors or for each"
     )
-    per_axis: bool = Field(
-        False, description="where drawn: true: one delay for each axis; false: one for each sensor"
-    )
+    per_axis: bool = Field(False, description="where drawn: true: one delay for each axis; false: one for each sensor")
 
     def drawn(self, bench: Bench, rng: np.random.Generator) -> Array:
         lag = 1e-3 * rng.standard_normal((bench.sensors, 3))
@@ -73,9 +70,7 @@ class ClockDrift(SensorEffectSpec):
     def read(self, bench: Bench) -> Array:
         values = np.array(self.given, dtype=float)
         if values.shape != (bench.sensors,):
-            raise UsageError(
-                f"effect clock_drift: ppm has {len(values)} values; the array has {bench.sensors} sensors"
-            )
+            raise UsageError(f"effect clock_drift: ppm has {len(values)} values; the array has {bench.sensors} sensors")
         return values
 
     def waveform(self, bench: Bench, coefficients: Array) -> Array:
@@ -99,7 +94,5 @@ class Jitter(SensorEffectSpec):
         return np.array(self.sd_s)
 
     def waveform(self, bench: Bench, coefficients: Array) -> Array:
-        shift = coefficients * stream(bench.seed, "jitter").standard_normal(
-            (len(bench.time), bench.sensors, 1)
-        )
+        shift = coefficients * stream(bench.seed, "jitter").standard_normal((len(bench.time), bench.sensors, 1))
         return _sampled_at(bench, np.repeat(shift, 3, axis=-1), self.name)
