@@ -17,8 +17,11 @@ _LAZY = {
     "DataError": "magtensor.errors",
     "UsageError": "magtensor.errors",
     "NotEnoughData": "magtensor.errors",
+    "Calibration": "magtensor.closed_loop",
+    "close_loop": "magtensor.closed_loop",
 }
 __all__ = [
+    "Calibration",
     "DataError",
     "ErrorModelsChoice",
     "MethodChoice",
@@ -26,6 +29,7 @@ __all__ = [
     "NotEnoughData",
     "UsageError",
     "__version__",
+    "close_loop",
     "error_model",
     "method",
     "metric",
@@ -34,6 +38,7 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
+    from magtensor.closed_loop import Calibration, close_loop
     from magtensor.components import (
         ErrorModelsChoice,
         MethodChoice,

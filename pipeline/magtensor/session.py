@@ -17,8 +17,10 @@ from magtensor.provenance import Provenance
 from magtensor.qc import told
 from magtensor.recipe.plan import Plan, PlannedStage, plan, read_plan
 from magtensor.recipe.source import Document
-from magtensor.runner import run
+from magtensor.runner import StageRecord, run
+from magtensor.survey.in_memory import Held
 from magtensor.survey.model import Survey, Variable
+from magtensor.survey.source import Source
 from magtensor.verdict import sentence, survey_block, verdict
 
 if TYPE_CHECKING:
@@ -48,11 +50,11 @@ class Finished:
     notes: tuple[str, ...] = ()
 
 
-def empty_survey(planned: Plan) -> Survey:
+def empty_survey(source: Plan | Source | Held) -> Survey:
     """A survey that only knows its source: where a recipe that loads begins."""
     import xarray as xr
 
-    return Survey(xr.DataTree(), source=planned.source())
+    return Survey(xr.DataTree(), source=source.source() if isinstance(source, Plan) else source)
 
 
 def run_recipe(
@@ -106,8 +108,7 @@ def run_plan(
 ) -> Finished:
     """Run a plan and write the files of the contract; as `run_recipe`."""
     require_writable(output)
-    source = planned.source()
-    files = source.files()
+    files = planned.source().files()
     refuse_overwriting([output / name for name in result.FILES], [*files, *([verify] if verify else [])])
     if verify is not None and verify.resolve() in {f.resolve() for f in files}:
         raise UsageError(f"{verify}: this is the survey itself; a verification survey is one that the fit has not seen")
@@ -117,12 +118,50 @@ def run_plan(
         from magtensor.long_survey import run_long
 
         return run_long(planned, output, memory_GiB, verify=verify, progress=progress)
-    done = run(planned, empty_survey(planned), progress=progress)
-    made_by = provenance.collect(planned, done.records, source.files())
+    return compute(planned, empty_survey(planned), verify=verify, progress=progress).write(output)
+
+
+@dataclass(frozen=True)
+class Computed:
+    """A run that was not written yet.
+
+    Attributes:
+        planned: what was run.
+        survey: after the last stage.
+        records: what each stage did.
+        outcome: the content of `verdict.json`.
+    """
+
+    planned: Plan
+    survey: Survey
+    records: tuple[StageRecord, ...]
+    outcome: dict[str, Any]
+
+    def provenance(self) -> Provenance:
+        """What made it."""
+        if isinstance(self.survey.source, Held):
+            made_by = provenance.collect(self.planned, self.records, ())
+            return replace(made_by, inputs=[self.survey.source.facts()])
+        return provenance.collect(self.planned, self.records, self.planned.source().files())
+
+    def write(self, output: Path) -> Finished:
+        """Write the files of the contract."""
+        made_by = result.write(output, self.survey, self.provenance(), self.outcome)
+        notes = (*(f"not determined: {words}" for words in left_open(self.survey)), *told(self.survey))
+        return Finished(output, self.outcome, sentence(self.outcome), made_by, self.survey, notes)
+
+
+def compute(
+    planned: Plan,
+    survey: Survey,
+    *,
+    verify: Path | Held | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> Computed:
+    """Run a plan on a survey (one that only knows its source), write nothing; else as `run_plan`."""
+    done = run(planned, survey, progress=progress)
     outcome = verdict(done.survey, verify=verification(done.survey, verify, planned) if verify else None)
-    made_by = result.write(output, done.survey, made_by, outcome)
-    notes = (*(f"not determined: {words}" for words in left_open(done.survey)), *told(done.survey))
-    return Finished(output, outcome, sentence(outcome), made_by, done.survey, notes)
+    return Computed(planned, done.survey, done.records, outcome)
 
 
 def again(
@@ -156,7 +195,7 @@ def is_hdf5(path: Path) -> bool:
         return False
 
 
-def verification(calibrated: Survey, path: Path, planned: Plan) -> dict[str, Any]:
+def verification(calibrated: Survey, path: Path | Held, planned: Plan) -> dict[str, Any]:
     """The error blocks of another survey: with the declared model alone, and with all that was adopted."""
     after = survey_block(apply_to(calibrated, path, planned))
     before = after
@@ -178,7 +217,7 @@ def with_declared_alone(calibrated: Survey) -> Survey:
 
 
 def apply_to(
-    calibration: Survey, path: Path, planned: Plan, *, tolerant: bool = False, rows: slice | None = None
+    calibration: Survey, path: Path | Held, planned: Plan, *, tolerant: bool = False, rows: slice | None = None
 ) -> Survey:
     """Another survey, loaded as the recipe loads and corrected with a calibration; the options as in `load_as`."""
     return apply_and_refine(calibration, path, planned, tolerant=tolerant, rows=rows, refine_rotation=False)[0]
@@ -186,7 +225,7 @@ def apply_to(
 
 def apply_and_refine(
     calibration: Survey,
-    path: Path,
+    path: Path | Held,
     planned: Plan,
     *,
     tolerant: bool,
@@ -239,16 +278,18 @@ def apply_and_refine(
     return survey, turned
 
 
-def load_as(planned: Plan, path: Path, *, tolerant: bool = False, rows: slice | None = None) -> Survey:
-    """Run only the stages of a recipe that read and prepare a survey (before any calibration) on another file.
+def load_as(planned: Plan, path: Path | Held, *, tolerant: bool = False, rows: slice | None = None) -> Survey:
+    """Run only the stages of a recipe that read and prepare a survey (before any calibration) on another one.
 
     A stage whose variables this survey lacks is left out; `tolerant` also leaves out one that the data refuse, as
     long as the survey itself was read (a field needs no base station to be corrected). `rows` reads only some samples.
     """
     stages = preparing_stages(planned)
-    section = planned.survey_for(path)
-    preparing = replace(planned, stages=stages, survey=section)
-    survey = replace(empty_survey(preparing), source=replace(preparing.source(), rows=rows))
+    if isinstance(path, Held):
+        preparing, survey = replace(planned, stages=stages), empty_survey(path)
+    else:
+        preparing = replace(planned, stages=stages, survey=planned.survey_for(path))
+        survey = empty_survey(replace(preparing.source(), rows=rows))
     for stage in stages:
         if all(any(_fits(p, need) for p in survey.paths()) for need in stage.declares.needs):
             try:

@@ -18,7 +18,7 @@ from magtensor.loop.waveform import NAME
 
 
 def described(found: Search, record: Record, declared: int) -> dict[str, Any]:
-    """`adopted`, `rejected` and `not_tested` of the contract.
+    """`adopted`, `rejected` and `not_tested` of the contract, and `steps`: each round of the search.
 
     Args:
         found: the search.
@@ -31,6 +31,32 @@ def described(found: Search, record: Record, declared: int) -> dict[str, Any]:
         "not_tested": [
             {"error_model": name, "missing": list(missing)} for name, missing in sorted(found.not_tested.items())
         ],
+        "steps": [_step(number, step) for number, step in enumerate(found.steps, 1)],
+    }
+
+
+def _step(number: int, step: Step) -> dict[str, Any]:
+    return {
+        "round": number,
+        "adopted": None if step.adopted is None else step.adopted.model.name,
+        "indistinguishable_from": list(step.rivals),
+        "dropped": list(step.dropped),
+        "refused": dict(step.refused),
+        "looked_at": [looked_at(candidate, step) for candidate in step.candidates],
+    }
+
+
+def looked_at(candidate: Candidate, step: Step) -> dict[str, Any]:
+    """What was found of one error model in one round."""
+    gain = candidate.assessment.gain
+    return {
+        "error_model": candidate.model.name,
+        "settings": {k: _plain(v) for k, v in candidate.model.settings.items()},
+        "p": candidate.adjusted_p,
+        "held_out_gain": float(gain.total),
+        "t": float(gain.t),
+        "passes": bool(candidate.passes),
+        "why": "adopted" if candidate is step.adopted else why(candidate, step.adopted),
     }
 
 

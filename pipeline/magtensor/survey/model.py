@@ -21,6 +21,7 @@ from magtensor.survey.flags import Flag
 if TYPE_CHECKING:
     import xarray as xr
 
+    from magtensor.survey.in_memory import Held
     from magtensor.survey.source import Source
 
 # What a stage may return for a path: a DataArray, or (dims, values, attributes).
@@ -54,7 +55,7 @@ class Survey:
     tree: xr.DataTree
     flags: tuple[Flag, ...] = ()
     attributes: Mapping[str, Any] = field(default_factory=dict)
-    source: Source | None = None
+    source: Source | Held | None = None
 
     @classmethod
     def build(cls, variables: Mapping[str, Variable], attributes: Mapping[str, Any] | None = None) -> Survey:
