@@ -94,7 +94,7 @@ def viscous_magnetisation(
     *,
     tau_s: Annotated[
         float,
-        Range(0.5, 500.0, count=7, spacing="log"),
+        Range(0.5, 500.0, count=7, spacing="log", sampled=True),
         Field(gt=0, description="time constant of the magnetisation, s"),
     ] = 20.0,
 ) -> Terms:

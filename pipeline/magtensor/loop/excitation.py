@@ -62,6 +62,11 @@ class Excitation:
         return float(self.time[-1] - self.time[0])
 
     @property
+    def spacing(self) -> float:
+        """s between neighbouring samples, the median."""
+        return float(np.median(np.diff(self.time)))
+
+    @property
     def elapsed(self) -> Array:
         """(N,) s since the survey's start."""
         return self.time - self.start

@@ -164,7 +164,7 @@ def tried_source(
     model = Adopted(component, {"noise_nT": [float(v) for v in after.residual.noise]})
     after = replace(after, adopted=(*after.adopted[:-1], model))
     evidence = Assessment(estimate, found.gain, found.gain, found.p, found.p, state.colours, estimate.theta)
-    return found, Source(record, after, Candidate(model, 1, terms, evidence, found.p, ALPHA))
+    return found, Source(record, after, Candidate(model, 1, terms, evidence, found.p, found.p, ALPHA))
 
 
 def _told_from_the_field(residual: Residual, held: Array, direction: Array) -> Course:

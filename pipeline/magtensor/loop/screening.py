@@ -48,6 +48,7 @@ class Candidate:
         terms: at the residual's samples.
         assessment: of the terms, given the models adopted before.
         adjusted_p: after the correction for settings and for the number of models.
+        adjusted_null_p: the same for what it explains in noise of the residual's own colour.
         alpha: what the adjusted p has to stay below.
         log_noise: what noise in the log of its channel, brought in by a model adopted before, lets it gain.
     """
@@ -57,6 +58,7 @@ class Candidate:
     terms: Terms
     assessment: Assessment
     adjusted_p: float
+    adjusted_null_p: float
     alpha: float = ALPHA
     log_noise: float = 0.0
 
@@ -66,14 +68,28 @@ class Candidate:
         return 0.0 < self.assessment.gain.total <= LOG_MARGIN * self.log_noise
 
     @property
-    def passes(self) -> bool:
-        """Both gates."""
+    def beyond_slow_noise(self) -> bool:
+        """Whether noise of the colour that the residual has without the model, all of it taken for noise, does not
+        explain what the model does: it predicts held-out blocks even so, or that much would be too unlikely.
+
+        What happens once, at the beginning or end, is seen by few blocks, and the others cannot predict it closely
+        enough in noise so strong.
+        """
+        return self.assessment.null_gain.total > 0 or self.adjusted_null_p < self.alpha
+
+    @property
+    def predicts(self) -> bool:
+        """Whether it is significant and predicts held-out blocks, in noise of the colour of what it leaves."""
         if self.of_the_log:
             return False
         gain = self.assessment.gain
         reduction = gain.total / max(float(gain.before.sum()), 1e-300)
-        beyond_slow_noise = self.assessment.null_gain.total > 0
-        return self.adjusted_p < self.alpha and beyond_slow_noise and gain.consistent and reduction > LEAST_REDUCTION
+        return self.adjusted_p < self.alpha and gain.consistent and reduction > LEAST_REDUCTION
+
+    @property
+    def passes(self) -> bool:
+        """Both gates."""
+        return self.predicts and self.beyond_slow_noise
 
 
 def repeatable(model: Component) -> bool:
@@ -129,17 +145,23 @@ def candidates_of(state: State, models: Sequence[Component], failed: dict[str, s
         assessment = assess(residual, terms, state.colours, state.terms)
         assessed[key] = Adopted(each.model, settings), each.tried, terms, assessment
     found = _one_each(list(assessed.values()))
-    order = sorted(range(len(found)), key=lambda i: min(1.0, found[i][3].p * found[i][1]))
-    adjusted = np.ones(len(found))
-    running = 0.0
-    for rank, i in enumerate(order):  # Holm: the models not looked at closely count as less significant ones
-        running = max(running, min(1.0, found[i][3].p * found[i][1] * max(len(names) - rank, 1)))
-        adjusted[i] = running
+    adjusted = _holm([a.p * tried for _, tried, _, a in found], len(names))
+    null = _holm([a.null_p * tried for _, tried, _, a in found], len(names))
     candidates = [
-        Candidate(model, tried, terms, assessment, float(p), alpha, _log_noise(state, model))
-        for (model, tried, terms, assessment), p in zip(found, adjusted, strict=True)
+        Candidate(model, tried, terms, assessment, p, null_p, alpha, _log_noise(state, model))
+        for (model, tried, terms, assessment), p, null_p in zip(found, adjusted, null, strict=True)
     ]
     return sorted(candidates, key=lambda c: -c.assessment.gain.total)
+
+
+def _holm(values: Sequence[float], models: int) -> list[float]:
+    """P values corrected for the number of models; those not looked at closely count as less significant ones."""
+    adjusted = [1.0] * len(values)
+    running = 0.0
+    for rank, i in enumerate(sorted(range(len(values)), key=lambda i: min(1.0, values[i]))):
+        running = max(running, min(1.0, values[i] * max(models - rank, 1)))
+        adjusted[i] = running
+    return adjusted
 
 
 @dataclass(frozen=True)

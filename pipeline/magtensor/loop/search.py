@@ -25,7 +25,7 @@ from magtensor.loop.residual import Residual
 from magtensor.loop.screening import ALPHA, Candidate, Scorer, candidates_of, generic, golden, profiled, repeatable
 from magtensor.loop.settings import Range
 from magtensor.loop.spectrum import spectral_lines
-from magtensor.loop.statistics import LEAST_T, Gain, family_p, held_out_gain
+from magtensor.loop.statistics import Gain, family_p, held_out_gain
 from magtensor.loop.terms import Terms, joined
 from magtensor.loop.trial import Trial, trial
 
@@ -165,7 +165,9 @@ def _first_kept(
     refused: dict[str, str] = {}
     while passing := [c for c in candidates if c.passes and c.model.name not in refused]:
         best = max(passing, key=lambda c: c.assessment.gain.total)
-        chosen, rivals = _simplest(best, passing, before.state)
+        possible = [c for c in candidates if c.predicts and c.model.name not in refused]
+        best = _containing(best, possible, before.state)
+        chosen, rivals = _simplest(best, possible, before.state)
         if say is not None:
             say(f"adopting {chosen.model.name}")
         after, why = _kept(record, before, chosen, how)
@@ -226,33 +228,53 @@ def _testable(x: Excitation, models: Sequence[Component]) -> tuple[list[Componen
     return [m for m in models if not lacking[m.name]], {name: lacks for name, lacks in lacking.items() if lacks}
 
 
-def _simplest(best: Candidate, candidates: Sequence[Candidate], state: State) -> tuple[Candidate, tuple[str, ...]]:
-    """The simplest of the models that the held-out blocks do not separate from the best, and the others' names."""
-    residual = state.residual
+def _containing(best: Candidate, possible: Sequence[Candidate], state: State) -> Candidate:
+    """The best of the models that predict more and leave `best` nothing to predict; `best` where there is none.
+
+    Slow noise could explain such a model, but not `best`, which is a part of what it explains: a drift, say, that is
+    more than a warming up.
+    """
+    more = [c for c in possible if c.assessment.gain.total > best.assessment.gain.total + SEPARATION]
+    for other in sorted(more, key=lambda c: -c.assessment.gain.total):
+        colours = other.assessment.colours
+        alone = _fold_gain(state, colours, other.terms)
+        if _fold_gain(state, colours, other.terms, best.terms).total - alone.total < SEPARATION:
+            return other
+    return best
+
+
+def _simplest(best: Candidate, possible: Sequence[Candidate], state: State) -> tuple[Candidate, tuple[str, ...]]:
+    """The simplest of the models that the held-out blocks do not separate from the best, and the others' names.
+
+    A model that slow noise could explain is named, and not chosen before one that it could not.
+    """
     colours = best.assessment.colours
-    reference = _fold_gain(best, residual, state, colours)
+    reference = _fold_gain(state, colours, best.terms)
     equal: list[Candidate] = [best]
-    for other in candidates:
-        if other is best or not other.passes:
+    for other in possible:
+        if other is best:
             continue
-        gain = _fold_gain(other, residual, state, colours)
-        if reference.total - gain.total < max(SEPARATION, LEAST_T * reference.apart(gain)):
+        ahead = reference.over(_fold_gain(state, colours, other.terms))
+        if ahead.total < SEPARATION or not ahead.consistent:
             equal.append(other)
-    chosen = min(equal, key=lambda c: (generic(c.model), c.assessment.estimate.rank, -c.assessment.gain.total))
+    chosen = min(
+        (c for c in equal if c is best or c.passes),
+        key=lambda c: (generic(c.model), c.assessment.estimate.rank, -c.assessment.gain.total),
+    )
     return chosen, tuple(sorted({c.model.name for c in equal if c is not chosen} - {chosen.model.name}))
 
 
-def _fold_gain(candidate: Candidate, residual: Residual, state: State, colours: Colours) -> Gain:
+def _fold_gain(state: State, colours: Colours, *terms: Terms) -> Gain:
+    """What terms gain on held-out folds in noise of given colours, those of the adopted models free."""
     from magtensor.loop.assessment import block_count
     from magtensor.loop.evidence import grams
 
-    terms, blocked = candidate.terms, None
-    if state.terms is not None:
-        terms = joined([state.terms, candidate.terms])
-        blocked = np.zeros(terms.count, dtype=bool)
-        blocked[: state.terms.count] = True
-    blocks = grams(residual, terms, colours.across, colours.along, block_count(len(residual.affine)))
-    return held_out_gain(blocks, residual.freedom, blocked)
+    given = [] if state.terms is None else [state.terms]
+    together = joined([*given, *terms])
+    blocked = np.arange(together.count) < sum(t.count for t in given)
+    count = block_count(len(state.residual.affine))
+    blocks = grams(state.residual, together, colours.across, colours.along, count)
+    return held_out_gain(blocks, state.residual.freedom, blocked)
 
 
 def _adopt(record: Record, state: State, chosen: Candidate, how: Fitting) -> State:

@@ -24,6 +24,7 @@ class Range:
         count: how many are tried before the best is refined between its neighbours.
         spacing: "linear" or "log" (with 0 added in front where `low` is 0).
         of_duration: the limits are fractions of the survey's duration.
+        sampled: nothing shorter than the time between samples is tried, which no sample would show.
     """
 
     low: float
@@ -31,9 +32,14 @@ class Range:
     count: int = 9
     spacing: str = "linear"
     of_duration: bool = False
+    sampled: bool = False
 
     def values(self, x: Excitation) -> list[Any]:
         """The grid for a survey."""
+        least = x.spacing if self.sampled else -np.inf
+        return [v for v in self._grid(x) if v >= least]
+
+    def _grid(self, x: Excitation) -> list[float]:
         low, high = (self.low * x.duration, self.high * x.duration) if self.of_duration else (self.low, self.high)
         if self.spacing == "linear":
             return [float(v) for v in np.linspace(low, high, self.count)]
