@@ -19,6 +19,7 @@ _LAZY = {
     "NotEnoughData": "magtensor.errors",
     "Calibration": "magtensor.closed_loop",
     "close_loop": "magtensor.closed_loop",
+    "explore": "magtensor.explorer",
 }
 __all__ = [
     "Calibration",
@@ -31,6 +32,7 @@ __all__ = [
     "__version__",
     "close_loop",
     "error_model",
+    "explore",
     "method",
     "metric",
     "reader",
@@ -50,6 +52,7 @@ if TYPE_CHECKING:
         stage,
     )
     from magtensor.errors import DataError, NotEnoughData, UsageError
+    from magtensor.explorer import explore
 
 
 def __getattr__(name: str) -> Any:

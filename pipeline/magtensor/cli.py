@@ -188,6 +188,25 @@ def plugins(as_json: bool, words: tuple[str, ...], plugin_folders: tuple[Path, .
 
 
 @cli.command()
+@click.argument("file", type=FILE, metavar="SURVEY")
+@click.option("--input", "survey", type=FILE, help="The survey, in place of a recipe's own.")
+@click.option("--verify", type=FILE, help="A second survey in a uniform field; its error goes into the verdict.")
+@click.option("--output", type=FOLDER, help="Folder for the results; default: the survey's name with .explored.")
+@plugins_option
+def explore(
+    file: Path, survey: Path | None, verify: Path | None, output: Path | None, plugin_folders: tuple[Path, ...]
+) -> int:
+    """See what a calibration of SURVEY leaves, adopt and reject error models by hand, look again.
+
+    SURVEY may also be a recipe with the stage close_loop, such as the file of an earlier session. Commands are typed
+    at the prompt or piped in; `help` lists them.
+    """
+    from magtensor.prompt import converse
+
+    return converse(file, survey=survey, verify=verify, output=output, plugins=plugin_folders)
+
+
+@cli.command()
 @click.argument("scenario", type=FILE)
 @click.option("--output", type=FILE, required=True, help="The survey file to write.")
 @click.option("--set", "overrides", multiple=True, metavar="PATH=VALUE", help="Change one value of the scenario.")

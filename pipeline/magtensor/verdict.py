@@ -86,10 +86,14 @@ def sentence(outcome: dict[str, Any]) -> str:
     noise = f"; sensor noise {_figure(floor)} nT" if floor is not None else ""
     told = f"{', '.join(figures)} {where}{noise}" if figures else f"no error figure can be given{noise}"
     model = f"the {' and '.join(outcome['declared'])} model" if outcome["declared"] else "no model"
-    adopted = [a["error_model"] for a in outcome["adopted"]]
+    adopted = [a["error_model"] for a in outcome["adopted"] if a.get("by") != "person"]
+    by_hand = [a["error_model"] for a in outcome["adopted"] if a.get("by") == "person"]
     left = outcome["unexplained"]
     if adopted:
         head = f"The residual was traced to {', '.join(adopted)}"
+        head += f"; adopted by hand: {', '.join(by_hand)}" if by_hand else ""
+    elif by_hand:
+        head = f"Adopted by hand: {', '.join(by_hand)}"
     elif left["present"] is None:
         head = f"Calibrated with {model}"
     elif left["present"]:

@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 from pydantic import Field
 
-from magtensor import ErrorModelsChoice, NotEnoughData, stage
+from magtensor import ErrorModelsChoice, stage
 from magtensor.survey.flags import flag_ranges
 from magtensor_stages.sensors import COMMON, common_frame
 
 if TYPE_CHECKING:
+    from magtensor.loop.inquiry import Inquiry
     from magtensor.survey.model import Survey
 
 
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
 )
 def close_loop(
     survey: Survey,
+    inquiry: Inquiry | None = None,
     *,
     declared: ErrorModelsChoice = (),
     search: ErrorModelsChoice = None,
@@ -35,37 +37,45 @@ def close_loop(
     worst_error: Annotated[
         float, Field(gt=0, le=1, description="refuse a fit whose predicted error of |b| reaches this fraction of F")
     ] = 0.05,
+    decisions: Annotated[
+        tuple[str, ...],
+        Field(description="`adopt NAME [setting=value ...]`, `reject NAME` or `loop`, taken in order; default: `loop`"),
+    ] = (),
 ) -> dict[str, Any]:
     """Calibrate all sensors jointly, find the effects that the declared model lacks, and refit with them.
 
     `declared` names error models that are in the model from the beginning (with settings, or none); `search` those
-    that may be adopted, all that are installed if left out.
+    that may be adopted, all that are installed if left out. `decisions` of a person (`magtensor explore` records them)
+    take the place of the loop's own. An inquiry that has been made already is used as it stands.
     """
     from magtensor.calibration.joint import calibrated
     from magtensor.loop.correction import as_elsewhere
+    from magtensor.loop.decisions import Decision, decision_of
     from magtensor.loop.errors_before_after import held_out_error
-    from magtensor.loop.model import Adopted, Fitting, require_determined
-    from magtensor.loop.outcome import described
-    from magtensor.loop.record import record_of
-    from magtensor.loop.search import search as find
+    from magtensor.loop.inquiry import inquiry_of
+    from magtensor.loop.model import Fitting, require_determined
     from magtensor.loop.stored import cleaned, effect_variables
     from magtensor.loop.unexplained import unexplained
 
-    record = record_of(survey)
-    if len(record.time) < 2:
-        raise NotEnoughData("no samples are left in use", where=str(survey.attributes.get("source", "")))
-    how = Fitting(reference_noise_nT, worst_error)
-    begin = [Adopted(component, settings) for component, settings in dict(declared or {}).values()]
-    names = {a.name for a in begin}
-    models = [component for name, (component, _) in dict(search or {}).items() if name not in names]
-    found = find(record, models, how, declared=begin, most_effects=most_effects, alpha=false_alarm)
+    if inquiry is None:
+        inquiry = inquiry_of(
+            survey,
+            dict(declared or {}),
+            [component for component, _ in dict(search or {}).values()],
+            Fitting(reference_noise_nT, worst_error),
+            most_effects=most_effects,
+            alpha=false_alarm,
+        )
+        for decision in [decision_of(text) for text in decisions] or [Decision("loop")]:
+            inquiry.decide(decision)
+    begin, how, found = inquiry.declared, inquiry.how, inquiry.found()
     first, last, record = found.first, found.last, found.record
     require_determined(record, last, how)
     calibration = calibrated(last.fit)
     outcome = {
         "declared": ["linear", *(a.name for a in begin)],
         "noise_floor_nT": float(last.residual.scale),
-    } | described(found, record, len(begin))
+    } | inquiry.told(found)
     outcome["unexplained"] = unexplained(found, record)
     keep = last.fit.keep
     before = held_out_error(record, begin, how, first.theta, keep)

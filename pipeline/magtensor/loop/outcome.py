@@ -42,12 +42,14 @@ def _step(number: int, step: Step) -> dict[str, Any]:
         "indistinguishable_from": list(step.rivals),
         "dropped": list(step.dropped),
         "refused": dict(step.refused),
-        "looked_at": [looked_at(candidate, step) for candidate in step.candidates],
+        "looked_at": [
+            judgement(c) | {"why": "adopted" if c is step.adopted else why(c, step.adopted)} for c in step.candidates
+        ],
     }
 
 
-def looked_at(candidate: Candidate, step: Step) -> dict[str, Any]:
-    """What was found of one error model in one round."""
+def judgement(candidate: Candidate) -> dict[str, Any]:
+    """What was found of one error model, and whether the first two gates let it pass."""
     gain = candidate.assessment.gain
     return {
         "error_model": candidate.model.name,
@@ -56,7 +58,7 @@ def looked_at(candidate: Candidate, step: Step) -> dict[str, Any]:
         "held_out_gain": float(gain.total),
         "t": float(gain.t),
         "passes": bool(candidate.passes),
-        "why": "adopted" if candidate is step.adopted else why(candidate, step.adopted),
+        "why": why(candidate, None),
     }
 
 

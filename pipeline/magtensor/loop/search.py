@@ -167,7 +167,7 @@ def _first_kept(
         best = max(passing, key=lambda c: c.assessment.gain.total)
         possible = [c for c in candidates if c.predicts and c.model.name not in refused]
         best = _containing(best, possible, before.state)
-        chosen, rivals = _simplest(best, possible, before.state)
+        chosen, rivals = simplest(best, possible, before.state)
         if say is not None:
             say(f"adopting {chosen.model.name}")
         after, why = _kept(record, before, chosen, how)
@@ -186,7 +186,7 @@ def _first_kept(
 def _kept(record: Record, before: Trial, chosen: Candidate, how: Fitting) -> tuple[Trial | None, str]:
     """The fit with a model, on fewer sensors where it hurts one that it does not help; None, and why, if it fails."""
     try:
-        after = trial(record, _polished(record, _adopt(record, before.state, chosen, how), how), how)
+        after = trial(record, _polished(record, adopt(record, before.state, chosen, how), how), how)
     except DataError as error:  # with coefficients that run away nothing is left to calibrate
         return None, f"it cannot be fitted: {error.what.split(':')[0]}"
     hurt = before.hurt_by(after)
@@ -243,7 +243,7 @@ def _containing(best: Candidate, possible: Sequence[Candidate], state: State) ->
     return best
 
 
-def _simplest(best: Candidate, possible: Sequence[Candidate], state: State) -> tuple[Candidate, tuple[str, ...]]:
+def simplest(best: Candidate, possible: Sequence[Candidate], state: State) -> tuple[Candidate, tuple[str, ...]]:
     """The simplest of the models that the held-out blocks do not separate from the best, and the others' names.
 
     A model that slow noise could explain is named, and not chosen before one that it could not.
@@ -277,7 +277,7 @@ def _fold_gain(state: State, colours: Colours, *terms: Terms) -> Gain:
     return held_out_gain(blocks, state.residual.freedom, blocked)
 
 
-def _adopt(record: Record, state: State, chosen: Candidate, how: Fitting) -> State:
+def adopt(record: Record, state: State, chosen: Candidate, how: Fitting) -> State:
     """Refit with the chosen model, first on all sensors, then on those that show it."""
     # what it found of the others too: begun from zero, a strong slow effect would pass for the colour of the noise
     moves = np.split(chosen.assessment.theta, np.cumsum([len(t) for t in state.theta]))

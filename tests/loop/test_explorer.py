@@ -1,0 +1,265 @@
+"""The loop by hand: `magtensor.explore` and the command of that name."""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from loop_cases import scenario, survey_file
+
+import magtensor
+from magtensor.cli import status_of
+from magtensor.explorer import Explorer
+from magtensor.loop.decisions import Decision, decision_of
+from magtensor.result import FILES
+from magtensor.session import run_recipe
+
+HEATER = {"type": "current_field", "rms_nT": 5.0, "channel": "current_heater"}
+SEARCH = ["current_field", "offset_drift", "channel_response"]
+PLUGIN = '''"""The heater's field."""
+from magtensor import error_model
+
+
+@error_model("instrument", needs=("current_heater",), source="diagram", typical="nT/A")
+def heater_field(x):
+    """The stray field of the heater."""
+    return x.offsets(x.channel("current_heater"){factor}, "nT/A")
+'''
+NOISE_NT = 0.15
+
+
+@pytest.fixture(scope="module")
+def survey(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    shorter = scenario()["motion"] | {"duration_s": 400.0}
+    return survey_file(tmp_path_factory.mktemp("survey"), scenario(5, HEATER, motion=shorter))
+
+
+@pytest.fixture
+def explorer(survey: Path) -> Explorer:
+    return magtensor.explore(survey, search=SEARCH, most_effects=2)
+
+
+def rms(explorer: Explorer) -> float:
+    return float(np.sqrt((explorer.residual["total_field"] ** 2).mean()))
+
+
+def test_look_adopt_look_again_undo(explorer: Explorer) -> None:
+    before = rms(explorer)
+    assert explorer.left_over()["present"]
+    ranking = explorer.ranking()
+    assert ranking.index[0] in ("current_field", "channel_response")
+    assert ranking.loc["current_field", "passes"]
+    told = explorer.adopt("current_field")
+    assert "passes the first two gates" in told
+    assert rms(explorer) < 1.5 * NOISE_NT < before / 3
+    assert not explorer.left_over()["present"]
+    assert explorer.undo() == "adopt current_field"
+    assert rms(explorer) == before
+    assert explorer.decisions == []
+    with pytest.raises(magtensor.UsageError, match="nothing to undo"):
+        explorer.undo()
+
+
+def test_the_result_says_who_did_what_and_can_be_made_again(tmp_path: Path, explorer: Explorer, survey: Path) -> None:
+    explorer.reject("channel_response")
+    explorer.adopt("offset_drift", order=1)
+    explorer.run_loop()
+    finished = explorer.save(tmp_path / "out")
+    assert {f.name for f in (tmp_path / "out").iterdir()} == set(FILES)
+    verdict = json.loads((tmp_path / "out" / "verdict.json").read_text())
+    adopted = {a["error_model"]: a for a in verdict["adopted"]}
+    assert {n: a["by"] for n, a in adopted.items()} == {"offset_drift": "person", "current_field": "loop"}
+    assert "does not pass the gates of the loop: not significant" in adopted["offset_drift"]["evidence"]["judged"]
+    assert adopted["offset_drift"]["settings"]["order"] == 1
+    by_hand = [r for r in verdict["rejected"] if r["by"] == "person"]
+    assert [r["error_model"] for r in by_hand] == ["channel_response"]
+    assert "passes the first two gates" in by_hand[0]["why"]
+    assert [d["decision"] for d in verdict["decisions"]] == [
+        "reject channel_response", "adopt offset_drift order=1", "loop",
+    ]  # fmt: skip
+    assert "traced to current_field; adopted by hand: offset_drift" in finished.sentence
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "offset_drift (by hand)" in page and "<code>reject channel_response</code>" in page
+    again = run_recipe(tmp_path / "out" / "result.nc", tmp_path / "again")
+    assert again.notes[0] == "reproduced bit for bit"
+    assert json.loads((tmp_path / "again" / "verdict.json").read_text()) == verdict
+
+
+def test_the_loop_alone_is_close_loop(explorer: Explorer, survey: Path) -> None:
+    explorer.run_loop()
+    by_itself = magtensor.close_loop(survey, search=SEARCH, most_effects=2)
+    assert explorer.verdict() == by_itself.computed.outcome
+    assert "decisions" not in by_itself.verdict
+
+
+def test_what_was_adopted_can_be_rejected(explorer: Explorer) -> None:
+    explorer.run_loop()
+    found = rms(explorer)
+    name = explorer.decisions[0][1].removeprefix("adopted ")
+    told = explorer.reject(name)
+    assert "taken out again" in told and rms(explorer) > 3 * found
+    assert name not in explorer.ranking().index
+    with pytest.raises(magtensor.UsageError, match="rejected already"):
+        explorer.reject(name)
+    explorer.adopt(name)  # a person may think again
+    assert rms(explorer) == pytest.approx(found, rel=0.02)
+    assert not explorer._inquiry.now.rejected
+
+
+@pytest.mark.parametrize(
+    ("name", "settings", "words"),
+    [
+        ("curent_field", {}, "did you mean current_field"),
+        ("current_field", {"chanel": "x"}, "did you mean channel"),
+        ("current_field", {"channel": "current_pump"}, "did you mean current_heater"),
+        ("offset_drift", {"order": "two"}, "offset_drift: order"),
+        ("supply_scale", {}, "no error model is called"),
+    ],
+)
+def test_a_mistake_changes_nothing(explorer: Explorer, name: str, settings: dict[str, Any], words: str) -> None:
+    with pytest.raises((magtensor.UsageError, magtensor.DataError), match=words):
+        explorer.adopt(name, **settings)
+    assert explorer.decisions == [] and explorer.adopted == []
+
+
+def test_a_source_that_the_log_shows_is_none_that_nobody_logged(survey: Path) -> None:
+    with pytest.raises(magtensor.DataError, match="taken off: its waveform follows channel current_heater"):
+        magtensor.explore(survey, search=["latent_source"]).adopt("latent_source")
+
+
+def test_a_model_without_its_channel(survey: Path) -> None:
+    with pytest.raises(magtensor.DataError, match=r"supply_scale needs supply\*.*it logs current_heater, temperature"):
+        magtensor.explore(survey, search=["supply_scale"]).adopt("supply_scale")
+
+
+def test_a_plugin_file_is_named_changed_and_named_again(tmp_path: Path, explorer: Explorer) -> None:
+    file = tmp_path / "heater.py"
+    file.write_text(PLUGIN.format(factor=""))
+    explorer.reject("channel_response")
+    explorer.run_loop()  # which knows nothing of the plugin yet
+    assert explorer.load_plugin(file) == ["heater_field"]
+    assert explorer.decisions[-1][0] == "loop without heater_field"
+    explorer.undo()
+    explorer.adopt("heater_field")
+    scale = first_coefficient(explorer)
+    assert explorer.load_plugin(file) == []
+    file.write_text(PLUGIN.format(factor=" * 2.0"))
+    assert explorer.load_plugin(file) == ["heater_field"]
+    assert first_coefficient(explorer) == pytest.approx(scale / 2, rel=1e-6)
+    for text in ("this is no Python", PLUGIN.format(factor=".nothing")):
+        file.write_text(text)
+        with pytest.raises(magtensor.UsageError, match="heater"):
+            explorer.load_plugin(file)
+        assert first_coefficient(explorer) == pytest.approx(scale / 2, rel=1e-6)
+    file.write_text(PLUGIN.format(factor=" * 2.0"))
+    explorer.save(tmp_path / "out")
+    assert run_recipe(tmp_path / "out" / "result.nc", tmp_path / "again").notes[0] == "reproduced bit for bit"
+
+
+def first_coefficient(explorer: Explorer) -> float:
+    state = explorer._inquiry.now.state
+    return float(state.theta[0][0])
+
+
+@pytest.mark.parametrize(
+    ("text", "decision"),
+    [
+        ("adopt a", Decision("adopt", "a")),
+        ("adopt a lag_s=1.5 channel=current_x", Decision("adopt", "a", {"lag_s": 1.5, "channel": "current_x"})),
+        ("adopt a on=true name='two words'", Decision("adopt", "a", {"on": True, "name": "two words"})),
+        ("adopt a name='\"7\"'", Decision("adopt", "a", {"name": "7"})),
+        ("reject a", Decision("reject", "a")),
+        ("loop", Decision("loop")),
+        ("loop without a b", Decision("loop", without=("a", "b"))),
+    ],
+)
+def test_decisions_as_text(text: str, decision: Decision) -> None:
+    assert decision_of(text) == decision
+    assert decision_of(str(decision)) == decision
+
+
+@pytest.mark.parametrize("text", ["", "adopt", "adopt x=1", "adopt a b", "reject a x=1", "lop", "loop x", "adopt 'a"])
+def test_texts_that_are_no_decisions(text: str) -> None:
+    with pytest.raises(magtensor.UsageError):
+        decision_of(text)
+
+
+def converse(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], file: Path, *commands: str
+) -> tuple[int, str]:
+    monkeypatch.setattr("sys.stdin", io.StringIO("\n".join(commands) + "\n"))
+    status = status_of(["explore", str(file)])
+    said = capsys.readouterr()
+    assert "Traceback" not in said.out + said.err
+    return status, said.out
+
+
+@pytest.fixture
+def recipe(tmp_path: Path, survey: Path) -> Path:
+    """A recipe with few error models, so that the session is quick."""
+    path = tmp_path / "few.yaml"
+    loop = {"close_loop": {"search": ["current_field", "offset_drift"]}}
+    stages = ["load", {"detrend_diurnal": {"uncovered": "mask"}}, loop, "assemble_tensor"]
+    path.write_text(yaml.safe_dump({"title": "few", "survey": str(survey), "stages": stages}))
+    return path
+
+
+def test_a_session_that_is_piped_in(
+    tmp_path: Path, recipe: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "bad.py").write_text(PLUGIN.format(factor=".nothing").replace("heater_field", "bad"))
+    commands = (
+        "help", "residual", "ranking", "nonsense", "adopt", "adopt curent_field", "load", "load bad.py", "load nowhere",
+        "show current_field", "adopt current_field channel=current_heater", "verdict", "reject offset_drift  # enough",
+        "undo", "status",
+    )  # fmt: skip
+    status, said = converse(monkeypatch, capsys, recipe, *commands)
+    assert status == 2  # something was refused
+    errors = [line for line in said.splitlines() if line.startswith("error: ")]
+    assert len(errors) == 6
+    assert "did you mean current_field" in errors[2] and "bad fails on this survey" in errors[4]
+    session = tmp_path / "few.session-1.yaml"
+    assert "not saved as a result" in said and session.name in said
+    assert yaml.safe_load(session.read_text())["stages"][2]["close_loop"]["decisions"] == [
+        "adopt current_field channel=current_heater"
+    ]
+    # taken up again, in the same file
+    status, said = converse(monkeypatch, capsys, session, "status", "save", "quit", "never reached")
+    assert status == 0 and "never reached" not in said
+    assert "1. adopt current_field channel=current_heater: passes" in said
+    assert "Adopted by hand: current_field" in said and "not saved" not in said
+    verdict = json.loads((tmp_path / "few.session-1.explored" / "verdict.json").read_text())
+    assert [a["by"] for a in verdict["adopted"]] == ["person"]
+    # and run as the recipe that it is
+    assert status_of(["run", str(session), "--output", "by_run"]) == 0
+    assert json.loads((tmp_path / "by_run" / "verdict.json").read_text()) == verdict
+
+
+def test_a_bug_or_a_stop_costs_one_line(
+    tmp_path: Path, recipe: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    faults = iter([ZeroDivisionError("a plugin's bug"), KeyboardInterrupt()])
+
+    def fail(self: Explorer) -> None:
+        raise next(faults)
+
+    monkeypatch.setattr(Explorer, "ranking", fail)
+    status, said = converse(monkeypatch, capsys, recipe, "ranking", "ranking", "status")
+    assert status == 2
+    assert "error: ZeroDivisionError: a plugin's bug (" in said
+    assert "error: stopped; nothing has changed" in said
+    assert "0 decisions" in said.split("stopped")[1]
+
+
+def test_what_cannot_be_explored(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "other.yaml").write_text(f"title: t\nsurvey: {tmp_path / 's.h5'}\nstages: [load]\n")
+    assert status_of(["explore", str(tmp_path / "nowhere.h5")]) == 3
+    assert status_of(["explore", str(tmp_path / "other.yaml")]) == 2
+    assert "no stage close_loop" in capsys.readouterr().err
