@@ -78,6 +78,7 @@ class Component:
     suffixes: tuple[str, ...] = ()  # of a reader: the file names it recognises
     effect: Literal["", "instrument", "site", "reference"] = ""  # of an error model: what it is an error of
     typical: str = ""  # of an error model: its usual magnitude
+    several: bool = False  # of a stage: it also fits the further surveys that a recipe names
     long: Callable[..., Any] | None = None  # of a stage: what it does with a recording longer than the memory
 
     @cached_property
@@ -199,12 +200,16 @@ def stage(
     gives: Iterable[str] = (),
     may_give: Iterable[str] = (),
     declares: Callable[[Mapping[str, Any]], Declares] | None = None,
+    several: bool = False,
     long: Callable[..., Any] | None = None,
 ) -> Callable[[F], F]:
     """Mark ``function(survey, *, options) -> {path: variable}`` as a stage.
 
     The survey is read-only; what the function returns is merged into it by the runner, which checks both
     against the declaration. `declares` replaces the four lists where they depend on the options.
+
+    A stage that fits the further surveys of a recipe (`survey: {with: ...}`) together with the survey is `several`; it
+    finds them in ``survey.source.further_surveys()``.
 
     A stage that calibrates, and can do so from a recording that is read in pieces, names as `long` a function of
     ``(survey, recording, *, options)`` that returns the variables and the samples (N,) of the recording to flag; the
@@ -215,6 +220,7 @@ def stage(
         "stage",
         name,
         declares=declares or Declares(tuple(needs), tuple(uses), tuple(gives), tuple(may_give)),
+        several=several,
         long=long,
     )
 

@@ -173,6 +173,8 @@ def apply_long(
 
 def _require_windows(planned: Plan) -> None:
     rest = planned.stages[len(preparing_stages(planned)) :]
+    if planned.survey is not None and planned.survey.with_:
+        raise UsageError(f"{planned.file}: several surveys cannot be fitted together with --memory")
     for stage in preparing_stages(planned):
         if stage.options.get("window_s") is not None:
             raise UsageError(f"{planned.file}: {stage.name}: window_s cannot be used with --memory")

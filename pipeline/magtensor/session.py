@@ -54,7 +54,10 @@ def empty_survey(source: Plan | Source | Held) -> Survey:
     """A survey that only knows its source: where a recipe that loads begins."""
     import xarray as xr
 
-    return Survey(xr.DataTree(), source=source.source() if isinstance(source, Plan) else source)
+    if isinstance(source, Plan):
+        planned = source
+        source = replace(planned.source(), prepared=lambda path: load_as(planned, path))
+    return Survey(xr.DataTree(), source=source)
 
 
 def run_recipe(
@@ -253,7 +256,7 @@ def apply_and_refine(
             require_positions(survey, calibration.values("calibration/position"), str(path))
         fitted = restored(calibration)
         survey = cleaned(survey, as_fitted(calibration, fitted), *stored_effects(calibration, planned.registry))
-        survey = survey.merged(corrected(fitted, survey))
+        survey = survey.merged(_named(corrected(fitted, survey), calibration))
         if refine_rotation:
             survey, turned = with_refined_rotation(survey, calibration, fitted)
             fitted = turned.calibration if turned is not None else fitted
@@ -276,6 +279,15 @@ def apply_and_refine(
             hint="name a calibration.nc or result.nc",
         )  # fmt: skip
     return survey, turned
+
+
+def _named(given: dict[str, Variable], calibration: Survey) -> dict[str, Variable]:
+    """The variables of a calibrated survey, with the words that say whose offsets were taken off."""
+    words = calibration["calibration/matrix"].attrs.get("offset_of")
+    if not words:
+        return given
+    dims, values, attributes = given["calibrated/b"]
+    return given | {"calibrated/b": (dims, values, dict(attributes) | {"offset_of": words})}
 
 
 def load_as(planned: Plan, path: Path | Held, *, tolerant: bool = False, rows: slice | None = None) -> Survey:
@@ -379,7 +391,9 @@ def apply(
             stored = stored.merged(calibration_variables(stored, result.sensors_of(stored), turned))
         result.write_calibration(save_calibration, stored, applied)
     words = str(found["calibrated/b"].attrs["rotation_refined"]) if refine_rotation else ""
-    return Applied(target, fit_in_words(survey_block(found)), words)
+    offsets = found["calibrated/b"].attrs.get("offset_of") if "calibrated/b" in found else None
+    told = f" Offsets: {offsets}." if offsets else ""
+    return Applied(target, fit_in_words(survey_block(found)) + told, words)
 
 
 def fit_in_words(block: dict[str, Any] | None) -> str:

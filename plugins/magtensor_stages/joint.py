@@ -2,23 +2,77 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Any
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field
 
-from magtensor import NotEnoughData, stage
+from magtensor import NotEnoughData, UsageError, stage
 from magtensor.calibration.coverage import WORST_ERROR
+from magtensor.components import Declares
 from magtensor.survey.flags import flag_ranges
 from magtensor_methods.scalar_options import WorstError
+from magtensor_stages import joint_surveys
 from magtensor_stages.sensors import COMMON, common_frame, naming
 
 if TYPE_CHECKING:
     from magtensor.calibration.recording import Recording
+    from magtensor.calibration.types import ArrayCalibration
     from magtensor.survey.model import Survey
 
 NoiseOfReference = Annotated[float, Field(ge=0, description="white noise of the total field, nT")]
 Robust = Annotated[bool, Field(description="leave out samples that no noise explains")]
+TotalField = Annotated[
+    Literal["measured", "constant", "per_survey", "per_segment"],
+    Field(
+        description="the reference's total field, or, without one, an unknown constant: over all samples, of each "
+        "survey, or of each segment. What is then unobservable is one scale of all sensors"
+    ),
+]
+DeclaredField = Annotated[
+    float | None,
+    Field(
+        gt=1000,
+        lt=1e6,
+        description="size of a total field that was not measured (a model's value), nT; on average, where it is an "
+        "unknown constant of each survey or segment. Default: the mean sensitivity is nominal",
+    ),
+]
+VectorReference = Annotated[
+    bool, Field(description="use the logged attitude and the reference's world field, which tell the rotation too")
+]
+AttitudeStd = Annotated[
+    float | None,
+    Field(gt=0, lt=30, description="standard deviation of the attitude about each axis, deg; default: from the data"),
+]
+OffsetsOf = Annotated[
+    Literal["own", "common"], Field(description="with further surveys: each has its own offsets, or all share one")
+]
+OffsetTaken = Annotated[
+    Literal["this", "mean"],
+    Field(
+        description="the offsets that this result and `magtensor apply` use: those of this survey, or the mean of all, "
+        "the guess for a survey that was not in the fit, with the scatter between surveys in their covariance"
+    ),
+]
+
+
+def declares(options: Mapping[str, Any]) -> Declares:
+    """What is needed depends on what is known of the field."""
+    field = _field(options["total_field"], options["total_field_nT"], options["vector_reference"])
+    needs = ["b_raw", "total_field"] if field.measured and not field.vector else ["b_raw"]
+    needs += ["segment"] if field.kind == "per_segment" else []
+    needs += ["attitude", "reference/world_field"] if field.vector else []
+    always = tuple(p for p in COMMON if not p.startswith("residual/"))
+    gives = COMMON if "total_field" in needs else always
+    return Declares(
+        tuple(needs),
+        ("total_field", "segment", "attitude", "reference/world_field"),
+        gives,
+        ("residual/contrast", "residual/total_field", "residual/total_field_before", "good"),
+    )
 
 
 def calibrate_recording(
@@ -28,54 +82,79 @@ def calibrate_recording(
     reference_noise_nT: NoiseOfReference = 0.0,
     robust: Robust = True,
     worst_error: WorstError = WORST_ERROR,
+    **others: Any,
 ) -> tuple[dict[str, Any], np.ndarray]:
     """The variables of a survey calibrated by a recording, and which samples (N,) of the recording no noise explains.
 
     The recording is the survey itself, or a longer one of which it is a selection.
+
+    Raises:
+        UsageError: other options than these are set.
     """
-    from magtensor.calibration.joint import calibrated, fit_recording
-
-    usable = np.ones(recording.count, dtype=bool) if recording.usable is None else recording.usable
-    if not usable.any():
-        raise NotEnoughData(
-            "no sample has all sensors in use and a total field", where=str(survey.attributes.get("source", ""))
-        )
+    for name, value in others.items():
+        if value != _PLAIN[name]:
+            raise UsageError(f"calibrate_joint: {name}: {value} needs the whole survey at once; leave --memory away")
     with naming(survey):
-        fit = fit_recording(recording, reference_noise=reference_noise_nT, robust=robust, worst_error=worst_error)
-        calibration = calibrated(fit)
-    return common_frame(survey, calibration, "joint"), usable & ~fit.keep
+        calibration, doubted = _from_recording(recording, reference_noise_nT, robust, worst_error)
+    return common_frame(survey, calibration, "joint"), doubted
 
 
-@stage(
-    needs=("b_raw", "total_field"),
-    gives=COMMON,
-    may_give=("residual/contrast", "good"),
-    long=calibrate_recording,
-)
+_PLAIN: dict[str, Any] = {
+    "total_field": "measured", "total_field_nT": None, "vector_reference": False, "attitude_std_deg": None,
+    "offsets": "own", "offset_of": "this",
+}  # fmt: skip
+
+
+@stage(declares=declares, several=True, long=calibrate_recording)
 def calibrate_joint(
     survey: Survey,
     *,
     reference_noise_nT: NoiseOfReference = 0.0,
     robust: Robust = True,
     worst_error: WorstError = WORST_ERROR,
+    total_field: TotalField = "measured",
+    total_field_nT: DeclaredField = None,
+    vector_reference: VectorReference = False,
+    attitude_std_deg: AttitudeStd = None,
+    offsets: OffsetsOf = "own",
+    offset_of: OffsetTaken = "this",
 ) -> dict[str, Any]:
     """Calibrate all sensors and the reference in one fit: maximum likelihood over every C and o, the unknown field of
     each sample eliminated.
 
-    One common frame, the nearest to the raw axes; the covariance of all parameters. Samples that no noise explains
-    are flagged. A recording of any length is read once (`--memory`).
+    One common frame, the nearest to the raw axes, or the platform's with a vector reference; the covariance of all
+    parameters. Samples that no noise explains are flagged. Further surveys that the recipe names (`survey: {with:
+    [...]}`) are fitted together with this one. A recording of any length is read once (`--memory`).
     """
     from magtensor.calibration.recording import InMemory
 
-    raw, total_field = survey.values("b_raw"), survey.values("total_field")
-    usable = survey.good & np.isfinite(total_field) & np.isfinite(raw).all(axis=(1, 2))
-    given, doubted = calibrate_recording(
-        survey,
-        InMemory(raw, total_field, usable),
-        reference_noise_nT=reference_noise_nT,
-        robust=robust,
-        worst_error=worst_error,
-    )
+    field = _field(total_field, total_field_nT, vector_reference)
+    several = survey.source is not None and bool(survey.source.further_files())
+    if offset_of == "mean" and (not several or offsets == "common"):
+        raise UsageError("calibrate_joint: offset_of: mean needs further surveys with offsets of their own")
+    if several or field.vector or field.kind.startswith("per_"):
+        how = (reference_noise_nT, attitude_std_deg, robust, worst_error)
+        calibration, extra, doubted = _from_surveys(survey, field, how, offsets == "common", offset_of == "mean")
+    else:
+        where = str(survey.attributes.get("source", ""))
+        usable = joint_surveys.usable_samples(survey, field, where)
+        raw = survey.values("b_raw")
+        if field.measured:
+            size = survey.values("total_field")
+        else:
+            typical = float(np.median(np.linalg.norm(raw[usable], axis=2)))
+            size = np.full(len(raw), typical if field.declared is None else field.declared)
+        with naming(survey):
+            recording = InMemory(raw, size, usable)
+            calibration, doubted = _from_recording(recording, reference_noise_nT, robust, worst_error)
+        extra = {}
+        if not field.measured:
+            calibration, _ = _without_reference(calibration, field, float(size[0]))
+    given = common_frame(survey, calibration, "joint") | extra
+    if offsets_of := extra.pop("offset_of", ""):
+        dims, values, attributes = given["calibration/matrix"]
+        given["calibration/matrix"] = (dims, values, dict(attributes) | {"offset_of": offsets_of})
+        del given["offset_of"]
     if doubted.any():
         given["good"] = (("time", "sensor"), survey.good_by_sensor & ~doubted[:, None], {"long_name": "may be used"})
         given["flags"] = flag_ranges(survey.time, doubted, by="calibrate_joint", reason=DOUBTED)
@@ -83,3 +162,76 @@ def calibrate_joint(
 
 
 DOUBTED = "no calibration and no noise explain it"
+
+
+def _field(kind: str, declared: float | None, vector: bool) -> joint_surveys.Field:
+    """A declared size says that nothing was measured."""
+    return joint_surveys.Field("constant" if kind == "measured" and declared is not None else kind, declared, vector)
+
+
+def _from_recording(
+    recording: Recording, reference_noise: float, robust: bool, worst_error: float
+) -> tuple[ArrayCalibration, np.ndarray]:
+    from magtensor.calibration.joint import calibrated, fit_recording
+
+    usable = np.ones(recording.count, dtype=bool) if recording.usable is None else recording.usable
+    if not usable.any():
+        raise NotEnoughData("no sample has all sensors in use and a total field")
+    fit = fit_recording(recording, reference_noise=reference_noise, robust=robust, worst_error=worst_error)
+    return calibrated(fit), usable & ~fit.keep
+
+
+def _without_reference(
+    calibration: ArrayCalibration, field: joint_surveys.Field, size: float
+) -> tuple[ArrayCalibration, float]:
+    """The scale that nothing measured put by declaration or by convention, said to be so, and the factor it took."""
+    from magtensor.calibration.common_scale import DECLARED, nominal_scale
+
+    if field.declared is not None:
+        words = (*calibration.unobservable, f"{DECLARED} ({field.declared:g} nT)")
+        return replace(calibration, unobservable=words), 1.0
+    scaled, factor, std = nominal_scale(calibration)
+    facts: dict[str, float | str] = {"total_field_nT": size * factor, "total_field_std_nT": size * std}
+    *others, scale = scaled.unobservable
+    words = (*others, f"{scale} (it is then {size * factor:.6g} nT, to {size * std:.2g} nT)")
+    return replace(scaled, diagnostics=calibration.diagnostics | facts, unobservable=words), factor
+
+
+def _from_surveys(
+    survey: Survey,
+    field: joint_surveys.Field,
+    how: tuple[float, float | None, bool, float],
+    common_offsets: bool,
+    mean: bool,
+) -> tuple[ArrayCalibration, dict[str, Any], np.ndarray]:
+    """The calibration, what else is told of it, and the samples (N,) of this survey that no noise explains."""
+    from magtensor.calibration.surveys.corrections import calibrated_surveys
+    from magtensor.calibration.surveys.fit import fit_surveys
+
+    reference_noise, attitude_std_deg, robust, worst_error = how
+    names, uses, samples = joint_surveys.gathered(survey, field)
+    with naming(survey):
+        fit = fit_surveys(
+            samples,
+            common_offsets=common_offsets,
+            reference_noise=reference_noise,
+            attitude=None if attitude_std_deg is None else float(np.radians(attitude_std_deg)),
+            robust=robust,
+            worst_error=worst_error,
+            mean_field=field.declared,
+        )
+        found = calibrated_surveys(fit)
+    calibration, factor = found.of_another() if mean else found.of_survey(0), 1.0
+    if not field.measured:
+        calibration, factor = _without_reference(calibration, field, float(np.mean(fit.found.sums.total_field)))
+        found = found if field.declared is not None else found.nominal()
+    elif field.vector and ("total_field" not in survey or survey["total_field"].attrs.get("origin") == "constant"):
+        words = "one scale that all sensors share: the size of the world field was declared, not measured"
+        calibration = replace(calibration, unobservable=(*calibration.unobservable, words))
+    extra = joint_surveys.survey_variables(names, fit, found, survey.sensors, factor)
+    if words := joint_surveys.offset_words(names, found, mean):
+        extra["offset_of"] = words
+    doubted = np.zeros(len(survey.time), dtype=bool)
+    own = np.flatnonzero(uses[0])
+    doubted[own[~fit.keep[: len(own)]]] = True
+    return calibration, extra, doubted

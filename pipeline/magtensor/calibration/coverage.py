@@ -194,7 +194,7 @@ def coverage(
         condition_number=condition,
         distance=first * field,
         second_distance=second * field,
-        required_distance=_required_ratio(len(raw)) * level * field,
+        required_distance=required_ratio(len(raw)) * level * field,
         worst_error=worst,
         accepted_error=worst_error * field,
         empty_cones=_empty_cones(thinned),
@@ -228,7 +228,7 @@ def require_coverage(found: Coverage) -> None:
     )
 
 
-def _required_ratio(samples: int) -> float:
+def required_ratio(samples: int) -> float:
     """How much farther the second quadric must lie than the first (question 1 of the module)."""
     freedom = samples - 8
     if freedom < 2:

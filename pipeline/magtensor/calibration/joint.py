@@ -145,7 +145,7 @@ def _accepted(
         stands_for=int(keep.sum()),
     )
     require_coverage(found)
-    _refuse_sensors(forward, offset, raw, total_field)
+    refuse_sensors(forward, offset, raw, total_field)
     return JointFit(forward, offset, plane, scalar, keep, found)
 
 
@@ -155,7 +155,7 @@ def _level(part: Together, plane: CommonField, scalar: ScalarFit, keep: Mask) ->
     return float(noise_std(field[:, None], part.total_field[keep])[0, 0])
 
 
-def _refuse_sensors(forward: Array, offset: Array, raw: Array, total_field: Array) -> None:
+def refuse_sensors(forward: Array, offset: Array, raw: Array, total_field: Array) -> None:
     """Mirrored sensors, and those that have nothing in common with the others, whose C is next to singular."""
     some = slice(None, None, max(1, len(raw) // 20_000))
     correction = np.asarray(np.linalg.pinv(forward, rcond=1e-9), dtype=np.float64)

@@ -8,7 +8,7 @@ from .common_field import CommonField
 from .maximum_likelihood import ScalarFit
 from .types import Array
 
-_SYMMETRIC = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))  # the order of the scalar fit's parameters
+SYMMETRIC = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))  # the order of the scalar fit's parameters
 
 
 def forward_covariance(plane: CommonField, scalar: ScalarFit, forward: Array, q: Array) -> Array:
@@ -30,7 +30,7 @@ def forward_covariance(plane: CommonField, scalar: ScalarFit, forward: Array, q:
     inverse_moments = np.linalg.inv(moments)
     # within the plane: parameters A = V' W (3, 4), row by row, change the field by U A (Q' b, 1)
     to_field = np.zeros((9, 3, 4))
-    for k, (i, j) in enumerate(_SYMMETRIC):
+    for k, (i, j) in enumerate(SYMMETRIC):
         to_field[k, :, :3] = (np.outer(scalar.matrix[i], q[j]) + np.outer(scalar.matrix[j], q[i])) / 2
     to_field[6:, :, 3] = scalar.matrix
     rows = to_field.reshape(9, 12)
@@ -51,12 +51,12 @@ def forward_covariance(plane: CommonField, scalar: ScalarFit, forward: Array, q:
         pick += [4 * (3 * s + i) + j for i in range(3) for j in range(3)]
         pick += [4 * (3 * s + i) + 3 for i in range(3)]
     covariance = covariance[np.ix_(pick, pick)]
-    fixing = _frame_projection(forward)
+    fixing = frame_projection(forward)
     out: Array = fixing @ covariance @ fixing.T
     return out
 
 
-def _frame_projection(forward: Array) -> Array:
+def frame_projection(forward: Array) -> Array:
     """(12 S, 12 S): adds to a change of C the rotation that keeps sum(C_s) symmetric, the condition of the frame."""
     sensors = len(forward)
     generators = np.zeros((3, 3, 3))

@@ -65,12 +65,12 @@ def fit_together(
             # one sensor has no neighbour to find its noise by: the residual along the field is all there is
             plane, scalar = _by_own_residual(plane, scalar, part, keep, reference_noise, complete)
         if two and given is not None and round_ < _TOLD_APART:
-            given = _told_apart(given, unfolded(plane, scalar), raw, total_field)
+            given = told_apart(given, unfolded(plane, scalar), raw, total_field)
             continue
         if not judge:
             break
         squares = _squared_residuals(plane, scalar, part, reference_noise)
-        limits = _limits(squares, len(plane.noise) - 3, len(raw))
+        limits = limits_from(squares, len(plane.noise) - 3, len(raw))
         again = (squares[0] <= limits.along) & (squares[1] <= limits.across)
         if np.array_equal(again, keep):
             break
@@ -83,7 +83,7 @@ def fit_together(
         if own_noise:
             given = output_noise(raw, keep, part.run)  # a spike passes for noise until it is left out
             if two:
-                given = _told_apart(given, unfolded(plane, scalar), raw, total_field)
+                given = told_apart(given, unfolded(plane, scalar), raw, total_field)
     return Found(plane, scalar, keep)
 
 
@@ -98,10 +98,10 @@ def unfolded(plane: CommonField, scalar: ScalarFit) -> tuple[Array, Array]:
 def limits_of(found: Found, part: Together, reference_noise: float, samples: int) -> Limits:
     """What squared whitened residuals noise explains, at `FALSE_REJECTION` for a survey of so many samples."""
     squares = _squared_residuals(found.plane, found.scalar, part, reference_noise)
-    return _limits(squares, len(found.plane.noise) - 3, samples)
+    return limits_from(squares, len(found.plane.noise) - 3, samples)
 
 
-def _limits(squares: tuple[Array, Array], freedom: int, samples: int) -> Limits:
+def limits_from(squares: tuple[Array, Array], freedom: int, samples: int) -> Limits:
     """Scaled by the median, so that outliers cannot hide each other."""
     from scipy.special import chdtri
 
@@ -133,7 +133,7 @@ def _by_own_residual(
     return plane, scalar.with_noise(factor)
 
 
-def _told_apart(noise: Array, found: tuple[Array, Array], raw: Array, total_field: Array) -> Array:
+def told_apart(noise: Array, found: tuple[Array, Array], raw: Array, total_field: Array) -> Array:
     """(2, 3) nT: the noise that two sensors' contrast shows, given to each as the total field tells them apart."""
     forward, offset = found
     b = np.einsum("sij,nsj->nsi", np.linalg.pinv(forward, rcond=1e-9), raw - offset)

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 
@@ -26,8 +27,8 @@ from .types import Array
 
 START_SAMPLES = (4_000, 20_000)  # the algebraic fit is only where the iteration begins; more where few give none
 CHUNK = 8192  # samples worked on at a time: their columns stay in the processor's cache
-_PAIRS = ((1, 2), (0, 2), (0, 1))
-_WEIGHTS = np.array([1.0, 1, 1, 2, 2, 2, 1, 1, 1])  # an off-diagonal element of E counts twice
+PAIRS = ((1, 2), (0, 2), (0, 1))
+WEIGHTS = np.array([1.0, 1, 1, 2, 2, 2, 1, 1, 1])  # an off-diagonal element of E counts twice
 
 
 @dataclass(frozen=True)
@@ -150,7 +151,7 @@ def scores(seen: Along, total_field: Array) -> Scores:
     m2 += m2
     toward -= m2 * h
     change = [float(toward[i] @ u[i]) for i in range(3)]
-    change += [float(toward[i] @ u[j] + toward[j] @ u[i]) for i, j in _PAIRS]
+    change += [float(toward[i] @ u[j] + toward[j] @ u[i]) for i, j in PAIRS]
     shrink /= seen.length
     shrink += m
     m2 /= 2.0 * seen.length
@@ -159,9 +160,9 @@ def scores(seen: Along, total_field: Array) -> Scores:
     scaled = np.multiply(u, seen.inverse_std, out=rows[6:])
     foot = u * total_field
     np.multiply(scaled, foot, out=rows[:3])
-    for k, (i, j) in enumerate(_PAIRS):
+    for k, (i, j) in enumerate(PAIRS):
         np.multiply(scaled[i], foot[j], out=rows[3 + k])
-    normal = rows @ rows.T * np.outer(_WEIGHTS, _WEIGHTS)
+    normal = rows @ rows.T * np.outer(WEIGHTS, WEIGHTS)
     moments = np.empty((4, 4))
     for i in range(3):
         for j in range(i + 1):
@@ -186,7 +187,7 @@ def fit_scalar(y: Array, total_field: Array, reference_noise: float = 0.0, compl
     ------
     NotEnoughData: the algebraic fit is no ellipsoid, the normal equations are singular, or it does not converge.
     """
-    found = _start(y, total_field)
+    found = algebraic_start(y, total_field)
 
     def at(matrix: Array, offset: Array) -> Scores:
         total = NOTHING
@@ -206,7 +207,13 @@ def fit_scalar(y: Array, total_field: Array, reference_noise: float = 0.0, compl
         return ScalarFit(matrix, offset, begun.cost / max(begun.samples - 9, 1), begun)
 
 
-def _start(y: Array, total_field: Array) -> Ellipsoid:
+def algebraic_start(y: Array, total_field: Array) -> Ellipsoid:
+    """The algebraic ellipsoid of some of the samples, of more where few give none.
+
+    Raises
+    ------
+    NotAnEllipsoid: there is none.
+    """
     few, more = (slice(None, None, max(1, len(y) // samples)) for samples in START_SAMPLES)
     try:
         return fit_ellipsoid(y[few], total_field[few], ellipsoid_restricted)
@@ -249,8 +256,18 @@ def minimised(
     raise NotEnoughData("the scalar fit does not converge", hint="look for disturbed samples, or add attitudes")
 
 
-def scoring_step(here: Scores, damping: float = 0.0) -> tuple[Array, float]:
-    """The step (9,) of the parameters, and twice the decrease of the cost that it promises: its squared length in
+class Slope(Protocol):
+    """What a step of scoring asks of the sums over samples: half the cost's derivative, and the information."""
+
+    @property
+    def gradient(self) -> Array: ...
+
+    @property
+    def normal(self) -> Array: ...
+
+
+def scoring_step(here: Slope, damping: float = 0.0) -> tuple[Array, float]:
+    """The step of the parameters, and twice the decrease of the cost that it promises: its squared length in
     standard deviations.
 
     Raises
@@ -261,14 +278,14 @@ def scoring_step(here: Scores, damping: float = 0.0) -> tuple[Array, float]:
     if not (np.isfinite(scale).all() and (scale > 0).all()):
         raise NotEnoughData("the scalar fit has a parameter that no sample depends on")
     scaled = here.normal / np.outer(scale, scale)
-    step: Array = -np.linalg.solve(scaled + damping * np.eye(9), here.gradient / scale) / scale
+    step: Array = -np.linalg.solve(scaled + damping * np.eye(len(scale)), here.gradient / scale) / scale
     return step, -float(here.gradient @ step)
 
 
 def stepped(matrix: Array, offset: Array, step: Array) -> tuple[Array, Array]:
     """Matrix and offset after the field has been changed to b + E b + e."""
     change = np.diag(1.0 + step[:3])
-    for value, (i, j) in zip(step[3:6], _PAIRS, strict=True):
+    for value, (i, j) in zip(step[3:6], PAIRS, strict=True):
         change[i, j] = change[j, i] = value
     moved = change @ matrix
     return moved, offset - np.linalg.solve(moved, step[6:])

@@ -161,21 +161,34 @@ def ellipsoid_restricted(x: Array) -> Array:
     full = design(x)
     triangle = np.asarray(np.linalg.qr(np.column_stack([full[:, 6:], full[:, :6]]), mode="r"))
     low, mixed, quad = triangle[:4, :4], triangle[:4, 4:], triangle[4:, 4:]
-    _, s, vt = np.linalg.svd(quad)
+    leading = restricted(quad)
+    tail = -np.linalg.lstsq(low, mixed @ leading, rcond=None)[0]
+    return np.concatenate([leading, tail])
+
+
+def restricted(quadratic: Array) -> Array:
+    """The six leading coefficients of the ellipsoid of least algebraic distance, under the restriction of
+    `ellipsoid_restricted`, from the rows (n, 6) that are left of the quadratic columns of the design once the others
+    have been projected off.
+
+    Raises
+    ------
+    NotAnEllipsoid: as there.
+    """
+    _, s, vt = np.linalg.svd(quadratic, full_matrices=False)
     # without noise the smallest singular value is rounding; a floor keeps the division finite
     back = vt.T / np.maximum(s, s[0] * 1e-15)
     for k in (256.0, 64.0, 16.0, 8.0, 4.0):
         restriction = np.diag([-1.0, -1, -1, -k, -k, -k])
         restriction[:3, :3] += (k / 2 - 1) * (1 - np.eye(3))
         values, vectors = np.linalg.eigh(back.T @ restriction @ back)
-        leading = back @ vectors[:, -1]
+        leading: Array = back @ vectors[:, -1]
         if values[-1] <= 0 or not np.all(np.isfinite(leading)):
             continue
         leading /= np.linalg.norm(leading)
         signs = np.linalg.eigvalsh(shape_matrix(leading))
         if signs[0] * signs[2] > 0:
-            tail = -np.linalg.lstsq(low, mixed @ leading, rcond=None)[0]
-            return np.concatenate([leading, tail])
+            return leading
     raise NotAnEllipsoid("no ellipsoid fits the raw output")
 
 

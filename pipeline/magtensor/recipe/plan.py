@@ -82,7 +82,7 @@ class Plan:
         """The survey section with its files replaced by one other file."""
         if self.survey is None:
             return SurveySection(file=str(Path(path).resolve()))
-        return self.survey.model_copy(update={"file": str(Path(path).resolve()), "files": None})
+        return self.survey.model_copy(update={"file": str(Path(path).resolve()), "files": None, "with_": None})
 
     def resolved(self) -> dict[str, Any]:
         """The recipe with every default written out; a plan made from it is this plan."""
@@ -157,6 +157,10 @@ class _Planner:
         survey = self.survey_section()
         stages = self.stages()
         self.check_flow(stages)
+        if survey is not None and survey.with_ and not any(s.component.several for s in stages.values()):
+            able = sorted(c.name for c in self.registry.components.values() if c.several)
+            what = f"no stage here fits several surveys together; {', '.join(able)} does"
+            self.problems.add(("survey", "with"), what)
         self.problems.raise_if_any()
         return Plan(
             title, description, authors, references, survey, tuple(stages.values()), self.registry,

@@ -39,6 +39,14 @@ class Held:
         """None."""
         return []
 
+    def further_files(self) -> list[Path]:
+        """None: surveys that are fitted together with it are named by a recipe."""
+        return []
+
+    def further_surveys(self) -> list[tuple[str, Survey]]:
+        """None."""
+        return []
+
     def facts(self) -> dict[str, Any]:
         """What provenance says of it; the hash is over its arrays."""
         from magtensor.provenance import content_sha256

@@ -308,6 +308,12 @@ class SurveySection(FileSection):
     reference: ReferenceSection | None = Field(None, description="the total field to calibrate against")
     attitude: AttitudeSection | None = Field(None, description="the platform's attitude")
     segment: SegmentSection | None = Field(None, description="what is contiguous")
+    with_: str | list[str] | None = Field(
+        None,
+        alias="with",
+        description="further surveys of the same instrument, read and prepared as this one, that calibrate_joint fits "
+        "together with it: files, or patterns with * and ?",
+    )
 
     @model_validator(mode="after")
     def _consistent(self) -> SurveySection:

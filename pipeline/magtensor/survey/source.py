@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import glob
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -27,12 +27,14 @@ class Source:
         base: what relative file names are relative to.
         readers: reader components by name.
         rows: read only these samples; all when None. The survey must be one HDF5 file in the canonical layout.
+        prepared: reads and prepares another survey as the recipe does this one; None outside a run.
     """
 
     section: SurveySection
     base: Path
     readers: Mapping[str, Component]
     rows: slice | None = None
+    prepared: Callable[[Path], Survey] | None = field(default=None, repr=False, compare=False)
     _tables: dict[Any, Tables] = field(default_factory=dict, repr=False, compare=False)
 
     def sections(self) -> list[tuple[str, FileSection]]:
@@ -77,7 +79,26 @@ class Source:
         Raises:
             DataError: a file is not there, or a pattern fits none.
         """
-        return list(dict.fromkeys(f for _, part in self.sections() for f in self.paths(part)))
+        own = [f for _, part in self.sections() for f in self.paths(part)]
+        return list(dict.fromkeys([*own, *self.further_files()]))
+
+    def further_files(self) -> list[Path]:
+        """The further surveys that the section names, this one left out.
+
+        Raises:
+            DataError: as in `files`.
+        """
+        names = self.section.with_ or []
+        named = FileSection(files=[names] if isinstance(names, str) else names)
+        own = {f.resolve() for f in self.paths(self.section)}
+        return list(dict.fromkeys(f for f in self.paths(named) if f.resolve() not in own))
+
+    def further_surveys(self) -> list[tuple[str, Survey]]:
+        """Name and content of each of them, prepared by the recipe's own stages."""
+        files = self.further_files()
+        if files and self.prepared is None:
+            raise UsageError("further surveys can be read only by a recipe that is run")
+        return [(f.name, self.prepared(f)) for f in files if self.prepared is not None]
 
     def paths(self, part: FileSection) -> list[Path]:
         """The files one part of the section names, patterns resolved, in order.

@@ -1,0 +1,91 @@
+"""The fit of several surveys as corrections, with the covariance of all parameters."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from magtensor.calibration.axes import turned_words
+from magtensor.calibration.common_scale import nominal, nominal_scale
+from magtensor.calibration.joint import nearest_frame
+from magtensor.calibration.types import Array, ArrayCalibration
+
+from .covariance import forward_covariance, to_corrections, with_offset
+from .fit import SurveysFit
+
+
+@dataclass(frozen=True)
+class SurveysCalibration:
+    """One correction matrix for each sensor and the offsets of every survey.
+
+    Attributes:
+        common: with the offset of the first survey.
+        offset: (K, S, 3) nT; K is 1 where all surveys share one.
+        covariance: (9 S + 3 S K,) squared: matrices sensor after sensor, then offsets survey after survey.
+    """
+
+    common: ArrayCalibration
+    offset: Array
+    covariance: Array
+
+    def of_survey(self, number: int) -> ArrayCalibration:
+        """With the offset of one survey."""
+        weights = np.eye(len(self.offset))[number if len(self.offset) > 1 else 0]
+        return self._with(weights, np.zeros((0, 0)))
+
+    def of_another(self) -> ArrayCalibration:
+        """With the mean offset, as the best guess for a survey that was not in the fit; the scatter of the offsets
+        between the surveys is then part of their covariance."""
+        count = len(self.offset)
+        weights = np.full(count, 1.0 / count)
+        away = (self.offset - self.offset.mean(axis=0)).reshape(count, -1)
+        scatter = away.T @ away / (count - 1) * (1 + 1 / count) if count > 1 else np.zeros((0, 0))
+        return self._with(weights, scatter)
+
+    def nominal(self) -> SurveysCalibration:
+        """The same with nominal mean sensitivity (`common_scale`), where no total field was measured."""
+        common, _, _ = nominal_scale(self.common)
+        size = 9 * len(common.matrix)
+        jacobian = np.eye(len(self.covariance))
+        jacobian[:size, :size] = nominal(self.common.matrix).jacobian
+        return SurveysCalibration(common, self.offset, jacobian @ self.covariance @ jacobian.T)
+
+    def _with(self, weights: Array, scatter: Array) -> ArrayCalibration:
+        sensors = len(self.common.matrix)
+        pick = with_offset(sensors, weights)
+        covariance = pick @ self.covariance @ pick.T
+        if scatter.size:
+            at = np.concatenate([12 * s + 9 + np.arange(3) for s in range(sensors)])
+            covariance[np.ix_(at, at)] += scatter
+        offset: Array = np.einsum("k,ksi->si", weights, self.offset)
+        return replace(self.common, offset=offset, covariance=covariance)
+
+
+def calibrated_surveys(fit: SurveysFit) -> SurveysCalibration:
+    """The fit in its frame: nearest to the raw axes, or the platform's where directions are known."""
+    sighted = fit.attitude_std is not None
+    q = np.eye(3) if sighted else nearest_frame(fit.forward)
+    forward = fit.forward @ q
+    matrix: Array = np.asarray(np.linalg.inv(forward), dtype=np.float64)
+    chain = to_corrections(matrix, len(fit.offset))
+    covariance = chain @ forward_covariance(fit, forward, q) @ chain.T
+    diagnostics: dict[str, float | str] = {
+        "samples": float(fit.keep.sum()),
+        "rejected": float((~fit.keep).sum()),
+        "chi2_total_field": fit.chi2_along,
+        "chi2_contrasts": fit.plane.chi2,
+        "noise_nT": float(np.sqrt(np.mean(fit.plane.noise**2))),
+        "condition_number": fit.coverage.condition_number,
+        "missing_attitudes": fit.coverage.missing,
+        "further_postures": str(fit.coverage.further),
+        "axes": "; ".join(turned_words(matrix)),
+    }
+    frame = "array (nearest to the raw axes)"
+    free: tuple[str, ...] = ("one rotation of the whole array: the frame nearest to the raw axes was chosen",)
+    if fit.attitude_std is not None:
+        diagnostics["attitude_std_deg"] = float(np.degrees(fit.attitude_std))
+        frame, free = "platform (by the attitude and the known field)", ()
+    with_first = with_offset(len(matrix), np.eye(len(fit.offset))[0])
+    common = ArrayCalibration(matrix, fit.offset[0], with_first @ covariance @ with_first.T, frame, free, diagnostics)
+    return SurveysCalibration(common, fit.offset, covariance)

@@ -1,0 +1,89 @@
+"""The joint fit without a reference, of several surveys, and with an attitude, against the bound that noise sets.
+
+`python studies/joint_surveys.py` prints the tables of docs/joint_surveys.md. Surveys are those of
+tests/joint/several_cases.py (the array of METHODS A4.8, 1 nT of noise, without the product's simulator). The first
+column of figures, error over bound, is the rms error of all parameters of all surveys, measured by the Cramer-Rao
+information and over the number of determined parameters: 1 at the bound. The information is computed there from the
+true parameters, sample by sample, with the unknown direction of each field projected off, and its size where that is
+an unknown constant. Behind it stands its standard error. Standardised errors are over the standard deviations that
+the fit states, all parameters pooled.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests/joint"))
+
+from several_cases import Case, errors, surveys
+
+CASES: dict[str, Sequence[tuple[str, Case]]] = {
+    "Without a scalar reference": [
+        (f"{s} sensor{'s' * (s > 1)}, {words}, {n} samples, {g} unknown constant{'s' * (g > 1)}",
+         Case(samples=(n,), sensors=s, tilt_deg=tilt, levels=g))
+        for s, n, g, tilt, words in (
+            (1, 400, 1, None, "any attitude"), (4, 400, 1, None, "any attitude"), (4, 40, 1, None, "any attitude"),
+            (4, 400, 1, 20.0, "+-20 deg"), (4, 400, 10, None, "any attitude"), (4, 400, 10, 40.0, "+-40 deg"),
+            (1, 2000, 20, 40.0, "+-40 deg"), (4, 2000, 20, 20.0, "+-20 deg"),
+        )
+    ],
+    "Several surveys": [
+        ("4 sensors, 200 + 100 + 50, any attitude, own offsets", Case(samples=(200, 100, 50))),
+        ("4 sensors, 200 + 100 + 50, +-20 deg, own offsets", Case(samples=(200, 100, 50), tilt_deg=20.0)),
+        ("4 sensors, 200 + 100 + 50, +-20 deg, common offsets",
+         Case(samples=(200, 100, 50), tilt_deg=20.0, apart_nT=0.0)),
+        ("1 sensor, 200 + 200, +-40 deg, own offsets", Case(samples=(200, 200), sensors=1, tilt_deg=40.0)),
+        ("4 sensors, 6 x 8 postures, any attitude, own offsets", Case(samples=(8,) * 6)),
+        ("4 sensors, 6 x 8 postures, +-40 deg, own offsets", Case(samples=(8,) * 6, tilt_deg=40.0)),
+        ("4 sensors, 20 x 40, +-40 deg, offsets 1000 nT apart",
+         Case(samples=(40,) * 20, tilt_deg=40.0, apart_nT=1000.0)),
+        ("4 sensors, 3 x 150, any attitude, a constant field unknown in each",
+         Case(samples=(150,) * 3, levels=1)),
+    ],
+    "With an attitude and a known field": [
+        (f"{s} sensor{'s' * (s > 1)}, {n} samples, {words}, attitude to {deg:g} deg",
+         Case(samples=(n,), sensors=s, tilt_deg=tilt, attitude_deg=deg))
+        for s, n, tilt, words, deg in (
+            (4, 400, None, "any attitude", 0.5), (4, 400, 20.0, "+-20 deg", 0.5), (4, 400, 20.0, "+-20 deg", 0.01),
+            (1, 400, 20.0, "+-20 deg", 0.1), (4, 2000, 40.0, "+-40 deg", 0.2), (4, 40, 40.0, "+-40 deg", 0.5),
+        )
+    ] + [("4 sensors, 200 + 200, +-40 deg, own offsets, attitude to 0.1 deg",
+          Case(samples=(200, 200), tilt_deg=40.0, attitude_deg=0.1))],
+}  # fmt: skip
+
+
+def table(name: str, cases: Sequence[tuple[str, Case]], runs: int) -> None:
+    """Print one table."""
+    print(f"## {name}\n")
+    print("| case | fits | error / bound | variance of standardised errors | inside 95 % | Mahalanobis / rank |")
+    print("|---|---|---|---|---|---|", flush=True)
+    for words, case in cases:
+        found = [errors(surveys(seed, case)) for seed in range(runs)]
+        pooled = np.array([f.standardised for f in found])
+        by_bound = np.array([f.by_bound for f in found])
+        ratio = np.sqrt(by_bound.mean())
+        spread = by_bound.std(ddof=1) / np.sqrt(runs) / (2 * ratio)
+        print(
+            f"| {words} | {runs} | {ratio:.3f} +- {spread:.3f} | {np.mean(pooled**2):.3f} | "
+            f"{100 * np.mean(np.abs(pooled) < 1.96):.1f} % | {np.mean([f.square for f in found]):.3f} |",
+            flush=True,
+        )
+    print()
+
+
+def main() -> None:
+    """Print the tables."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--runs", type=int, default=200)
+    chosen = parser.parse_args()
+    for name, cases in CASES.items():
+        table(name, cases, chosen.runs)
+
+
+if __name__ == "__main__":
+    main()

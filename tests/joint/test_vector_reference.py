@@ -1,0 +1,104 @@
+"""Attitude and known field together with the total field: weights, standard errors, and the rotation they tell."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from several_cases import Case, Truth, errors, fitted, surveys
+
+from magtensor.calibration.surveys import sums
+from magtensor.calibration.surveys.corrections import calibrated_surveys
+from magtensor.calibration.surveys.directions import sighting
+from magtensor.calibration.surveys.fit import fit_surveys
+from magtensor.errors import DataError, NotEnoughData
+
+
+@pytest.mark.parametrize(
+    "case",
+    [
+        Case(attitude_deg=0.5, tilt_deg=20.0),
+        Case(attitude_deg=0.02),
+        Case(attitude_deg=0.3, tilt_deg=30.0, sensors=1),
+        Case(samples=(150, 150), attitude_deg=0.3, tilt_deg=30.0),
+        Case(samples=(300,), attitude_deg=0.002, tilt_deg=30.0, noise_nT=5.0),
+    ],
+    ids=str,
+)
+def test_errors_are_those_that_noise_allows(case: Case) -> None:
+    found = [errors(surveys(seed, case)) for seed in range(40)]
+    pooled = np.array([f.standardised for f in found])
+    assert np.mean(pooled**2) == pytest.approx(1.0, abs=0.25)
+    assert 0.91 < np.mean(np.abs(pooled) < 1.96) < 0.985
+    assert np.mean([f.square for f in found]) == pytest.approx(1.0, abs=0.2)
+    assert np.sqrt(np.mean([f.by_bound for f in found])) == pytest.approx(1.0, abs=4 / np.sqrt(2 * 40 * 12))
+
+
+def test_gradient_of_the_cost() -> None:
+    rng = np.random.default_rng(1)
+    unit = rng.standard_normal((40, 3))
+    unit /= np.linalg.norm(unit, axis=1, keepdims=True)
+    matrix = np.array([[1.1, 0.2, -0.1], [0.0, 0.9, 0.3], [0.1, 0.0, 1.3]])
+    centre = np.repeat([0, 1], 20)
+    centres = np.array([[0.4, -0.5, 0.6], [0.1, 0.2, -0.3]])
+    y = 20.0 * unit @ np.linalg.inv(matrix).T + centres[centre] + 0.3 * rng.standard_normal((40, 3))
+    field = np.full(40, 20.0)
+    data = sums.InPlane(y, centre, field)
+    known = unit + 0.02 * rng.standard_normal(unit.shape)
+    known /= np.linalg.norm(known, axis=1, keepdims=True)
+    data = replace(data, sighting=sighting(matrix, data.fields(matrix, centres), field, known, 0.02, 0.0))
+
+    def cost(step: np.ndarray) -> float:
+        moved = (np.eye(3) + step[:9].reshape(3, 3)) @ matrix
+        shifted = centres - np.linalg.solve(moved, step[9:].reshape(2, 3).T).T
+        return sums.summed(data, moved, shifted).cost
+
+    numeric = [(cost(1e-5 * e) - cost(-1e-5 * e)) / 4e-5 for e in np.eye(15)]
+    found = sums.summed(data, matrix, centres)
+    np.testing.assert_allclose(found.gradient, numeric, atol=1e-6 * np.abs(numeric).max())
+
+
+def test_the_attitude_s_error_is_found() -> None:
+    for deg in (0.05, 1.0):
+        found = fit_surveys(surveys(4, Case(samples=(2000,), attitude_deg=deg, tilt_deg=30.0)).samples)
+        assert found.attitude_std is not None
+        # of 4000 angles
+        assert np.degrees(found.attitude_std) == pytest.approx(deg, rel=4 / np.sqrt(2 * 4000))
+
+
+def turn_error(truth: Truth) -> float:
+    """rad about the worst axis, of the frame."""
+    product = fitted(truth).common.matrix[0] @ truth.forward[0]
+    u, _, vt = np.linalg.svd(product)
+    turn = u @ vt
+    return float(np.abs([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]).max()) / 2
+
+
+def test_the_common_rotation_is_determined() -> None:
+    case = Case(samples=(600,), attitude_deg=0.5)
+    angles = [turn_error(surveys(seed, case)) for seed in range(20)]
+    # N directions, each telling two of three angles: about an axis 0.5 deg / sqrt(2 N / 3)
+    one = np.radians(0.5) / np.sqrt(2 * 600 / 3)
+    assert np.sqrt(np.mean(np.square(angles))) < 2.5 * one
+    assert calibrated_surveys(fit_surveys(surveys(0, case).samples)).common.frame.startswith("platform")
+
+
+def test_a_poor_attitude_does_not_attenuate_the_matrix() -> None:
+    """With 2 deg of error in a cone of 20 deg a regression on the attitude's field shrinks C by some 2 %."""
+    found = []
+    for seed in range(10):
+        truth = surveys(seed, Case(samples=(3000,), attitude_deg=2.0, tilt_deg=20.0))
+        product = fitted(truth).common.matrix @ truth.forward
+        found.append(np.linalg.svd(product)[1] - 1.0)
+    assert np.abs(np.mean(found, axis=0)).max() < 2e-5
+
+
+def test_refusals() -> None:
+    truth = surveys(3, Case(samples=(200,), attitude_deg=0.1))
+    assert truth.samples.direction is not None
+    with pytest.raises(DataError, match="mirror"):
+        fit_surveys(replace(truth.samples, raw=-truth.samples.raw, direction=truth.samples.direction))
+    flat = np.tile([[1.0, 0, 0]], (200, 1))
+    with pytest.raises(NotEnoughData, match="did not leave a plane"):
+        fit_surveys(replace(truth.samples, direction=flat))
