@@ -9,6 +9,9 @@ degrees, or 136 static postures. It goes through the whole search, with every er
 - **right**: the effect, or a model declared indistinguishable from it, is all that was adopted; **more**: something
   else was adopted beside it; **wrong**: only something else was.
 - **told**: nothing was adopted, but the verdict says that something unexplained is left; **missed**: it does not.
+- **part**, where several effects were in the survey: some of them were adopted, and nothing else.
+
+Surveys with several effects have them from different families, so that none is another's rival, each of the rms given.
 
 The **oracle** tests the right effect alone, once, with the right settings, in noise whose colour it knows from the same
 survey without the effect, at the loop's level of one in 200. The loop has it harder: it tries some thirty models
@@ -39,7 +42,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import loop_power_page
 import numpy as np
-from loop_surveys import BASE, EFFECTS, MOTIONS, recorded, scenario
+from loop_surveys import BASE, EFFECTS, FAMILIES, MOTIONS, recorded, scenario
 
 from magtensor.components import Component
 from magtensor.errors import MagtensorError
@@ -55,7 +58,7 @@ from magtensor.registry import Registry
 from magtensor.simulate import Simulated, simulate
 
 NOISES = {"white": 0.0, "white and 1/f": 0.02}  # nT/rtHz at 1 Hz
-FIRST_CLEAN, FIRST_SEED = 1000, 2000
+FIRST_CLEAN, FIRST_SEED, FIRST_SEVERAL = 1000, 2000, 3000
 RIGHT: dict[str, dict[str, Any]] = {
     "temperature_offset": {"channel": "temperature", "lag_s": 100.0},
     "temperature_scale": {"channel": "temperature"},
@@ -124,7 +127,7 @@ def oracle(trial: Trial, simulation: Simulated, record: Record, state: State) ->
     """The p value of the effect alone with its right settings; None where these cannot be known."""
     from scipy.stats import chi2
 
-    if trial.effect in ("", "latent_source"):
+    if trial.effect in ("", "latent_source") or "+" in trial.effect:
         return None
     settings = dict(RIGHT.get(trial.effect, {}))
     if trial.effect in ("offset_drift", "scale_drift"):
@@ -164,10 +167,12 @@ def judged(effect: str, found: Search, left: bool) -> str:
     if not adopted:
         return "told" if left else "missed" if effect else "clean"
     named = [{s.adopted.model.name, *s.rivals} for s in found.steps if s.adopted and s.adopted.model.name in adopted]
-    hits = [effect in names for names in named]
-    if not any(hits):
-        return "wrong"
-    return "right" if all(hits) and len(adopted) == 1 else "more"
+    wanted = set(effect.split("+")) - {""}
+    strange = not all(wanted & names for names in named)
+    all_found = bool(wanted) and all(any(w in names for names in named) for w in wanted)
+    if all_found:
+        return "more" if strange or len(adopted) > len(wanted) else "right"
+    return "wrong" if strange else "part"
 
 
 def tried(trial: Trial) -> dict[str, Any]:
@@ -186,8 +191,10 @@ def tried(trial: Trial) -> dict[str, Any]:
     row["adopted"] = [a.name for a in found.last.adopted]
     row["rivals"] = sorted({r for s in found.steps for r in s.rivals})
     row["left"] = left["description"]
-    if trial.effect and trial.effect not in row["adopted"] and row["outcome"] != "right":
-        row["why"] = lost(found, trial.effect)
+    if row["outcome"] != "right":
+        missed = [e for e in trial.effect.split("+") if e and e not in row["adopted"]]
+        if missed:
+            row["why"] = "; ".join(lost(found, e) for e in missed)
     return row
 
 
@@ -204,6 +211,12 @@ def planned(chosen: argparse.Namespace) -> Iterator[Trial]:
                 for motion in motions:
                     for effect in chosen.effects.split(","):
                         yield Trial(effect, float(amplitude), motion, noise, seed, chosen.rate)
+    for seed in range(FIRST_SEVERAL, FIRST_SEVERAL + chosen.several):
+        rng = np.random.default_rng(seed)
+        for count in (2, 3):
+            families = rng.choice(len(FAMILIES), count, replace=False)
+            effects = "+".join(str(rng.choice(FAMILIES[i])) for i in families)
+            yield Trial(effects, 1.0, "tumbling", "white and 1/f", seed, chosen.rate)
 
 
 def in_time(trial: Trial, end: float) -> dict[str, Any] | None:
@@ -218,6 +231,7 @@ def main() -> None:
     parser.add_argument("--page", type=Path, help="write the tables here")
     parser.add_argument("--clean", type=int, default=10, help="clean surveys of each motion and noise")
     parser.add_argument("--seeds", type=int, default=1, help="surveys of each effect, amplitude, motion and noise")
+    parser.add_argument("--several", type=int, default=10, help="tumbling surveys with two and with three effects, 1 x")
     parser.add_argument("--effects", default=",".join(EFFECTS))
     parser.add_argument("--amplitudes", default="1,3,0.3", help="rms of the effect in units of the white noise")
     parser.add_argument("--motions", default=",".join(MOTIONS))

@@ -130,6 +130,21 @@ def by_effect(rows: Sequence[Row]) -> Iterator[str]:
     yield from table(["effect", *(f"{m}, {n}, {a:g} x" for m, n, a in columns)], lines)
 
 
+def together(rows: Sequence[Row]) -> Iterator[str]:
+    """Surveys with more than one effect."""
+    yield "## Surveys with several effects"
+    yield ""
+    if not rows:
+        return
+    words = ("right", "more", "part", "wrong")
+    lines = []
+    for count in sorted({row["effect"].count("+") + 1 for row in rows}):
+        own = [row for row in rows if row["effect"].count("+") + 1 == count]
+        lines.append([str(count), *(among(o)(own) for o in words)])
+        lines[-1] += [str(sum(r["outcome"] == o for r in own)) for o in ("told", "missed")]
+    yield from table(["effects", *words, "told", "missed"], lines)
+
+
 def losses(rows: Sequence[Row]) -> Iterator[str]:
     """Every effect that the loop did not name rightly, and where it lost it."""
     yield "## What was lost, and where"
@@ -142,11 +157,13 @@ def page(docstring: str, command: str, rows: Sequence[Row], not_made: int) -> st
     """The whole page; `not_made`: trials that the time given did not suffice for."""
     rate = " and ".join(f"{r:g}" for r in sorted({row["rate_Hz"] for row in rows}))
     ran = [row for row in rows if row["outcome"] != "cannot be"]
-    clean, effects = [r for r in ran if not r["effect"]], [r for r in ran if r["effect"]]
+    clean, several = [r for r in ran if not r["effect"]], [r for r in ran if "+" in r["effect"]]
+    effects = [r for r in ran if r["effect"] and "+" not in r["effect"]]
     seeds = len({r["seed"] for r in effects})
     cells = groups(effects, *KEY)
     text = ["# The power of the loop", "", docstring.split("\n\n", 2)[2].rsplit("\n\n", 1)[0], ""]
-    text += [f"`{command}` ({rate} samples a second; {len(clean)} clean surveys, {len(effects)} with an effect)", ""]
+    counts = f"{len(clean)} clean surveys, {len(effects)} with one effect, {len(several)} with several"
+    text += [f"`{command}` ({rate} samples a second; {counts})", ""]
     if not_made:
         text += [
             f"Not complete: {not_made} more trials of this command were not made in the time given (`--seconds`).",
@@ -158,5 +175,11 @@ def page(docstring: str, command: str, rows: Sequence[Row], not_made: int) -> st
             "the effects of its cell as if they were draws of one kind; of a single effect a single survey says little."
         )
         text.append("")
-    every = [*clean_surveys(clean), *power(effects), *by_effect(effects), *losses(effects)]
+    every = [
+        *clean_surveys(clean),
+        *power(effects),
+        *by_effect(effects),
+        *together(several),
+        *losses([*effects, *several]),
+    ]
     return "\n".join([*text, *every]).rstrip() + "\n"

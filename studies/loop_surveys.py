@@ -83,18 +83,28 @@ EFFECTS: dict[str, dict[str, Any]] = {
     "reference_step": {"time_s": [700.0]},
     "passing_source": {"time_s": 900.0, "closest_m": [12.0, 0.0, 0.0], "velocity_m_s": [0.0, 0.5, 0.0]},
 }
+FAMILIES = (
+    ("temperature_offset", "temperature_rate", "offset_drift", "warm_up", "supply_offset", "offset_step"),
+    ("temperature_scale", "scale_drift", "supply_scale"),
+    ("nonlinearity_quadratic", "nonlinearity_cubic", "cross_field"),
+    ("hysteresis", "sampling_lag", "eddy_current", "bandwidth", "clock_drift", "viscous_magnetisation"),
+    ("current_field", "moving_part", "periodic_interference", "frame_flexure", "channel_response", "latent_source"),
+    ("fixed_source", "site_gradient"),
+    ("reference_clock", "reference_step"),
+)  # those of one family may imitate each other
 STAGES = "title: study\nstages: [load, {detrend_diurnal: {uncovered: mask}}]\n"
 
 WHITE_NT: float = BASE["instrument"]["noise"]["white_sd_nT"]
 
 
 def scenario(motion: str, flicker: float, seed: int, effect: str = "", amplitude: float = 0.0) -> dict[str, Any]:
-    """A survey with 1/f noise (nT/rtHz at 1 Hz) and an effect of so many times the white noise, none for ""."""
+    """A survey with 1/f noise (nT/rtHz at 1 Hz) and an effect of so many times the white noise; several joined by "+",
+    none for ""."""
     made = copy.deepcopy(BASE) | {"motion": MOTIONS[motion], "seed": seed, "truth": False}
     made["instrument"]["seed"] = 40 + seed
     made["instrument"]["noise"]["flicker_nT_per_rtHz"] = flicker
     if effect:
-        made["effects"] = [{"type": effect, "rms_nT": amplitude * WHITE_NT} | EFFECTS[effect]]
+        made["effects"] = [{"type": e, "rms_nT": amplitude * WHITE_NT} | EFFECTS[e] for e in effect.split("+")]
     return made
 
 

@@ -69,20 +69,21 @@ def close_loop(
         for decision in [decision_of(text) for text in decisions] or [Decision("loop")]:
             inquiry.decide(decision)
     begin, how, found = inquiry.declared, inquiry.how, inquiry.found()
+    require_determined(found.record, found.last, how)
+    looked_at, keep = found.record, found.last.fit.keep
+    left = unexplained(found, looked_at)
+    before = held_out_error(looked_at, begin, how, found.first.theta, keep)
+    same = len(found.last.adopted) == len(begin)
+    seen = as_elsewhere(looked_at, calibrated(found.last.fit), found.last)
+    after = before if same else held_out_error(seen, found.last.adopted, how, found.last.theta, keep)
+    found = inquiry.on_every_sample(found)
     first, last, record = found.first, found.last, found.record
-    require_determined(record, last, how)
     calibration = calibrated(last.fit)
     outcome = {
         "declared": ["linear", *(a.name for a in begin)],
         "noise_floor_nT": float(last.residual.scale),
     } | inquiry.told(found)
-    outcome["unexplained"] = unexplained(found, record)
-    keep = last.fit.keep
-    before = held_out_error(record, begin, how, first.theta, keep)
-    same = len(last.adopted) == len(begin)
-    seen = as_elsewhere(record, calibration, last)
-    after = before if same else held_out_error(seen, last.adopted, how, last.theta, keep)
-    outcome["held_out"] = {"before": before, "after": after}
+    outcome |= {"unexplained": left, "held_out": {"before": before, "after": after}}
     clean = cleaned(survey, calibration, last.adopted, last.theta, record.means)
     given = common_frame(clean, calibration, "joint") | effect_variables(last.adopted, last.theta, record.means)
     before_fit = np.linalg.norm(survey.values("b_raw"), axis=2) - survey.values("total_field")[:, None]

@@ -16,6 +16,7 @@ from magtensor.components import Component
 from magtensor.errors import DataError, NotEnoughData, UsageError, did_you_mean
 from magtensor.loop.decisions import Decision
 from magtensor.loop.latent import NAME, renewed, sought, tried_source
+from magtensor.loop.long_record import on_every_sample, part_of
 from magtensor.loop.model import Adopted, Fitting, Record, State, joint_state, without
 from magtensor.loop.needs import missing
 from magtensor.loop.outcome import described, removal, why
@@ -57,6 +58,7 @@ class Inquiry:
     """A survey whose residual is being traced.
 
     Attributes:
+        whole: all samples; the inquiry is into a part of them if they are very many.
         models: the error models that may be adopted.
         how: how the joint fit is made.
         first: the state with what was declared alone.
@@ -74,7 +76,7 @@ class Inquiry:
     ) -> None:
         self.models, self.how = list(models), how
         self.declared, self.most_effects, self.alpha = list(declared), most_effects, alpha
-        self._record = record
+        self.whole, self._part = record, part_of(record, declared, how)
         self._history: list[Moment] = []
         self._ranked: tuple[Candidate, ...] | None = None
 
@@ -82,8 +84,8 @@ class Inquiry:
     def now(self) -> Moment:
         """Where it stands; the first fit is made when it is first asked for."""
         if not self._history:
-            state = joint_state(self._record, self.declared, self.how)
-            self._history.append(Moment(self._record, state, (DECLARED,) * len(self.declared)))
+            state = joint_state(self._part.record, self.declared, self.how)
+            self._history.append(Moment(self._part.record, state, (DECLARED,) * len(self.declared)))
         return self._history[-1]
 
     @property
@@ -157,7 +159,7 @@ class Inquiry:
         if self._ranked is None:
             failed: dict[str, str] = {}
             models = [m for m in self.open_models() if m.name != NAME]
-            state = with_lines(self.now.state, self.now.record)
+            state = with_lines(self.now.state, self.now.record, self._part.lines)
             self._ranked = tuple(candidates_of(state, models, failed, self.alpha))
             self._history[-1] = replace(self.now, failed={**(self.now.failed or {}), **failed})
         return self._ranked
@@ -242,15 +244,16 @@ class Inquiry:
         Returns, raises: as `decide`.
         """
         before = self.now if self._history else None
-        record = self._record if before is None else before.record
+        record = self._part.record if before is None else before.record
         begin = self.declared if before is None else list(before.state.adopted)
         closed = {*leaving, *((before.rejected or {}) if before else ())}
         models = [m for m in self.models if m.name not in closed]
         found = search(
-            record, models, self.how, declared=begin, most_effects=self.most_effects, alpha=self.alpha
+            record, models, self.how, declared=begin, most_effects=self.most_effects, alpha=self.alpha,
+            lines=self._part.lines,
         )  # fmt: skip
         if before is None:
-            before = Moment(self._record, found.first, (DECLARED,) * len(self.declared))
+            before = Moment(self._part.record, found.first, (DECLARED,) * len(self.declared))
             self._history.append(before)
         names = [a.name for a in found.last.adopted[len(begin) :]]
         told = f"adopted {', '.join(names)}" if names else "nothing to adopt"
@@ -275,6 +278,10 @@ class Inquiry:
         steps = (*now.steps, Step(now.state, self.ranking(), None))  # a last look, as the loop takes one
         shared = sought(last, now.record)
         return Search(self.first, last, steps, not_tested, self.now.failed or {}, now.record, shared)
+
+    def on_every_sample(self, found: Search) -> Search:
+        """The search as it stands, its calibrations fitted to all samples."""
+        return on_every_sample(found, self.whole, self._part, self.how)
 
     def told(self, found: Search) -> dict[str, Any]:
         """`adopted`, `rejected`, `not_tested`, `steps` of the verdict and, where a person had a hand, `decisions`."""
@@ -345,7 +352,7 @@ class Inquiry:
             if adopted.name == component.name and given.items() <= adopted.settings.items():
                 raise UsageError(f"{component.name} is adopted already with these settings")
         failed: dict[str, str] = {}
-        state = with_lines(self.now.state, self.now.record)
+        state = with_lines(self.now.state, self.now.record, self._part.lines)
         found = candidates_of(state, [pinned(component, given)], failed, self.alpha)
         if not found:
             reason = failed.get(component.name, "it has no regressor here that the calibration does not have already")

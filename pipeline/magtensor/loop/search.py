@@ -85,6 +85,7 @@ def search(
     declared: Sequence[Adopted] = (),
     most_effects: int = MOST_EFFECTS,
     alpha: float = ALPHA,
+    lines: Sequence[float] | None = None,
     say: Callable[[str], None] | None = None,
 ) -> Search:
     """Find the effects that the declared model lacks.
@@ -97,6 +98,7 @@ def search(
     declared: error models that are in the fit from the beginning, never dropped.
     most_effects: stop after so many adoptions.
     alpha: family-wise false-alarm probability of the first gate.
+    lines: Hz, the strongest in the spectrum of the survey that the record is a part of; sought in the record if None.
     say: called with a line about each round.
     """
     if declared:
@@ -110,7 +112,7 @@ def search(
     steps: list[Step] = []
     failed: dict[str, str] = {}
     for _ in range(most_effects + 1):
-        state = with_lines(state, record)
+        state = with_lines(state, record, lines)
         if len(state.adopted) - len(declared) >= most_effects:
             break
         taken = {a.name for a in state.adopted}
@@ -352,10 +354,11 @@ def _polished(record: Record, state: State, how: Fitting) -> State:
     return state
 
 
-def with_lines(state: State, record: Record) -> State:
-    """The state, its excitation knowing the strongest lines in the spectrum of what is left."""
-    lines = tuple(f for f, _, _ in spectral_lines(state.residual, record.time[state.residual.samples]))
-    return replace(state, excitation=replace(state.excitation, lines=lines))
+def with_lines(state: State, record: Record, lines: Sequence[float] | None = None) -> State:
+    """The state, its excitation knowing the strongest lines in the spectrum of what is left, or those given."""
+    if lines is None:
+        lines = [f for f, _, _ in spectral_lines(state.residual, record.time[state.residual.samples])]
+    return replace(state, excitation=replace(state.excitation, lines=tuple(lines)))
 
 
 def _slices(state: State) -> list[slice]:

@@ -1,0 +1,56 @@
+"""Long surveys: a search on evenly chosen samples, and the calibration that follows from it on every sample.
+
+What a search costs grows with the samples, and it asks some thousand questions; an effect that forty thousand samples
+do not show is below a hundredth of their noise. The lines in the spectrum are those of all samples, because the chosen
+ones would show a fast tone as a slow one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from magtensor.loop.latent import renewed
+from magtensor.loop.model import Adopted, Fitting, Record, State, joint_state
+from magtensor.loop.search import Search
+from magtensor.loop.spectrum import spectral_lines
+
+MOST_SEARCHED = 40_000  # samples
+
+
+@dataclass(frozen=True)
+class Part:
+    """What the search of a survey looks at.
+
+    Attributes:
+        record: every k-th sample, the whole survey where it is not long.
+        first: the declared model fitted to all samples; None where the record holds them all.
+        lines: Hz, of all samples; None where the record holds them all.
+    """
+
+    record: Record
+    first: State | None = None
+    lines: tuple[float, ...] | None = None
+
+
+def part_of(record: Record, declared: Sequence[Adopted], how: Fitting, most: int = MOST_SEARCHED) -> Part:
+    """The samples of a survey that are searched."""
+    step = -(-len(record.time) // most)
+    if step == 1:
+        return Part(record)
+    first = joint_state(record, declared, how)
+    lines = tuple(f for f, _, _ in spectral_lines(first.residual, record.time[first.residual.samples]))
+    return Part(record.at(np.arange(step // 2, len(record.time), step)), first, lines)
+
+
+def on_every_sample(found: Search, whole: Record, part: Part, how: Fitting) -> Search:
+    """The search with its calibrations fitted to all samples of the survey."""
+    if part.first is None:
+        return found
+    if found.record.waveform is not None:
+        whole = replace(whole, waveform=np.interp(whole.time, found.record.time, found.record.waveform))
+    last = joint_state(whole, found.last.adopted, replace(how, searching=False), found.last.theta, found.last.lines)
+    whole, last = renewed(whole, last, how)
+    return replace(found, first=part.first, last=last, record=whole)
