@@ -12,8 +12,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from magtensor.calibration.joint import JointFit
 from magtensor.loop.latent import renewed
-from magtensor.loop.model import Adopted, Fitting, Record, State, joint_state
+from magtensor.loop.model import Adopted, Fitting, Record, joint_state
 from magtensor.loop.search import Search
 from magtensor.loop.spectrum import spectral_lines
 
@@ -26,12 +27,12 @@ class Part:
 
     Attributes:
         record: every k-th sample, the whole survey where it is not long.
-        first: the declared model fitted to all samples; None where the record holds them all.
+        alone: the declared model fitted to all samples; None where the record holds them all.
         lines: Hz, of all samples; None where the record holds them all.
     """
 
     record: Record
-    first: State | None = None
+    alone: JointFit | None = None
     lines: tuple[float, ...] | None = None
 
 
@@ -40,17 +41,17 @@ def part_of(record: Record, declared: Sequence[Adopted], how: Fitting, most: int
     step = -(-len(record.time) // most)
     if step == 1:
         return Part(record)
-    first = joint_state(record, declared, how)
-    lines = tuple(f for f, _, _ in spectral_lines(first.residual, record.time[first.residual.samples]))
-    return Part(record.at(np.arange(step // 2, len(record.time), step)), first, lines)
+    every = joint_state(record, declared, how)
+    lines = tuple(f for f, _, _ in spectral_lines(every.residual, record.time[every.residual.samples]))
+    return Part(record.at(np.arange(step // 2, len(record.time), step)), every.fit, lines)
 
 
 def on_every_sample(found: Search, whole: Record, part: Part, how: Fitting) -> Search:
     """The search with its calibrations fitted to all samples of the survey."""
-    if part.first is None:
+    if part.alone is None:
         return found
     if found.record.waveform is not None:
         whole = replace(whole, waveform=np.interp(whole.time, found.record.time, found.record.waveform))
     last = joint_state(whole, found.last.adopted, replace(how, searching=False), found.last.theta, found.last.lines)
     whole, last = renewed(whole, last, how)
-    return replace(found, first=part.first, last=last, record=whole)
+    return replace(found, first=replace(found.first, fit=part.alone), last=last, record=whole)

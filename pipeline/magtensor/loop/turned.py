@@ -18,7 +18,7 @@ from magtensor.loop.colour import Colour
 
 LEAST_EXCESS = 1.0  # over the white power: a mode with less is left to the stationary part
 MOST_MODES = 100
-MOST_ENTRIES = 3e7
+MOST_ENTRIES = 1e7
 LAWS = (1.0, 2.0)  # of the power over frequency, tried for a single sensor
 STRENGTHS = np.geomspace(1.0, 1e6, 13)  # of its slowest mode over white noise
 SINGLE_MODES = 40
