@@ -11,11 +11,13 @@ from typing import TYPE_CHECKING, Any
 import yaml
 
 from magtensor.accuracy import figure
+from magtensor.calibration.nominal import Nominal
 from magtensor.closed_loop import STAGE, loop_document
 from magtensor.errors import MagtensorError, UsageError
 from magtensor.loop.decisions import Decision, decision_of
 from magtensor.loop.inquiry import Inquiry, inquiry_of
 from magtensor.loop.model import Fitting
+from magtensor.loop.near_nominal import begun
 from magtensor.loop.outcome import judgement
 from magtensor.loop.unexplained import unexplained
 from magtensor.recipe.plan import Plan, plan
@@ -307,11 +309,16 @@ class Explorer:
             file = planned.registry.origin[path].file
             if component.kind == "error_model" and file is not None:
                 models.setdefault(component.name, component)
-        return inquiry_of(
-            self._prepared, dict(options["declared"] or {}), models.values(),
-            Fitting(options["reference_noise_nT"], options["worst_error"]),
-            most_effects=options["most_effects"], alpha=options["false_alarm"],
-        )  # fmt: skip
+
+        def inquired(how: Fitting) -> Inquiry:
+            return inquiry_of(
+                self._prepared, dict(options["declared"] or {}), models.values(), how,
+                most_effects=options["most_effects"], alpha=options["false_alarm"],
+            )  # fmt: skip
+
+        near = Nominal(options["nominal_scale"], options["nominal_angle_deg"], options["nominal_offset"])
+        nominal = near if options["undetermined"] == "nominal" else None
+        return begun(inquired, Fitting(options["reference_noise_nT"], options["worst_error"]), nominal)
 
     def _used(self, function: Any) -> Any:
         inquiry = self._inquiry

@@ -101,7 +101,8 @@ def sentence(outcome: dict[str, Any]) -> str:
     else:
         head = f"Calibrated with {model}; nothing is left that asks for another effect"
     tail = f"; unexplained: {left['description']}" if left["present"] else ""
-    return f"{head}: {told}{tail}{_disagreement(outcome)}."
+    doubt = outcome.get("calibration", {}).get("description", "")
+    return f"{head}: {told}{tail}{_disagreement(outcome)}{f'; {doubt}' if doubt else ''}."
 
 
 def _disagreement(outcome: dict[str, Any]) -> str:

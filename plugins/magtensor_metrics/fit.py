@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
@@ -9,6 +10,7 @@ from pydantic import Field
 
 from magtensor import metric
 from magtensor.accuracy import COMPONENTS, error_block, figure, rms
+from magtensor.calibrated import left_open
 from magtensor.calibration.noise import noise_std
 from magtensor.qc import Verdict
 
@@ -90,6 +92,20 @@ def flagged(survey: Survey, *, warn_share: Share = 0.01, fail_share: Share = 0.3
         )
         verdicts.append(Verdict(f"flagged {sensor}", share, "1", state, words, warn_share))  # type: ignore[arg-type]
     return verdicts
+
+
+@metric(needs=("calibration/matrix",))
+def determined(survey: Survey) -> list[Verdict]:
+    """Fails a calibration that its attitudes did not determine.
+
+    Its value is what |b| is known to in the worst direction.
+    """
+    facts = json.loads(str(survey["calibration/matrix"].attrs.get("diagnostics", "{}")))
+    if "undetermined" not in facts:
+        return []
+    further = [w for w in left_open(survey) if w.startswith("what would help most")]
+    words = "; ".join([str(facts["undetermined"]), *further])
+    return [Verdict("calibration determined", float(facts["worst_error_nT"]), "nT", "fail", words)]
 
 
 def _against_noise(

@@ -161,6 +161,7 @@ def calibrate_joint(
     return given
 
 
+ALL_THE_SAME = "close_loop looks for effects all the same, with sensors taken near nominal (undetermined: nominal)"
 DOUBTED = "no calibration and no noise explain it"
 
 
@@ -177,7 +178,11 @@ def _from_recording(
     usable = np.ones(recording.count, dtype=bool) if recording.usable is None else recording.usable
     if not usable.any():
         raise NotEnoughData("no sample has all sensors in use and a total field")
-    fit = fit_recording(recording, reference_noise=reference_noise, robust=robust, worst_error=worst_error)
+    try:
+        fit = fit_recording(recording, reference_noise=reference_noise, robust=robust, worst_error=worst_error)
+    except NotEnoughData as error:
+        hint = "; ".join(p for p in (error.hint, ALL_THE_SAME) if p)
+        raise NotEnoughData(error.what, where=error.where, hint=hint) from error
     return calibrated(fit), usable & ~fit.keep
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field
@@ -41,35 +41,61 @@ def close_loop(
         tuple[str, ...],
         Field(description="`adopt NAME [setting=value ...]`, `reject NAME` or `loop`, taken in order; default: `loop`"),
     ] = (),
+    undetermined: Annotated[
+        Literal["nominal", "refuse"],
+        Field(
+            description="attitudes that do not determine the calibration: search with sensors near nominal (see below) "
+            "and say so, or refuse the survey"
+        ),
+    ] = "nominal",
+    nominal_scale: Annotated[
+        float, Field(gt=0, le=0.5, description="assumed then, one standard deviation: relative, of a scale factor")
+    ] = 0.1,
+    nominal_angle_deg: Annotated[
+        float, Field(gt=0, le=30, description="likewise: of the direction of an axis, deg")
+    ] = 6.0,
+    nominal_offset: Annotated[
+        float, Field(gt=0, le=2, description="likewise: of an offset, as a part of the total field")
+    ] = 0.1,
 ) -> dict[str, Any]:
     """Calibrate all sensors jointly, find the effects that the declared model lacks, and refit with them.
 
     `declared` names error models that are in the model from the beginning (with settings, or none); `search` those
     that may be adopted, all that are installed if left out. `decisions` of a person (`magtensor explore` records them)
-    take the place of the loop's own. An inquiry that has been made already is used as it stands.
+    take the place of the loop's own. An inquiry that has been made already is used as it stands. Where the attitudes do
+    not determine the calibration (level flight), what is known of sensors beforehand stands in, and the result says so.
     """
     from magtensor.calibration.joint import calibrated
+    from magtensor.calibration.nominal import Nominal
     from magtensor.loop.correction import as_elsewhere
     from magtensor.loop.decisions import Decision, decision_of
     from magtensor.loop.errors_before_after import held_out_error
     from magtensor.loop.inquiry import inquiry_of
-    from magtensor.loop.model import Fitting, require_determined
+    from magtensor.loop.model import Fitting
+    from magtensor.loop.near_nominal import doubt_of, labelled, settled
     from magtensor.loop.stored import cleaned, effect_variables
     from magtensor.loop.unexplained import unexplained
 
-    if inquiry is None:
-        inquiry = inquiry_of(
+    def inquired(how: Fitting) -> Inquiry:
+        begun = inquiry_of(
             survey,
             dict(declared or {}),
             [component for component, _ in dict(search or {}).values()],
-            Fitting(reference_noise_nT, worst_error),
+            how,
             most_effects=most_effects,
             alpha=false_alarm,
         )
         for decision in [decision_of(text) for text in decisions] or [Decision("loop")]:
-            inquiry.decide(decision)
-    begin, how, found = inquiry.declared, inquiry.how, inquiry.found()
-    require_determined(found.record, found.last, how)
+            begun.decide(decision)
+        return begun
+
+    nominal = None if undetermined == "refuse" else Nominal(nominal_scale, nominal_angle_deg, nominal_offset)
+    if inquiry is None:
+        inquiry, found, refused = settled(inquired, Fitting(reference_noise_nT, worst_error), nominal)
+    else:
+        made = inquiry
+        inquiry, found, refused = settled(lambda _: made, made.how, None)
+    begin, how = inquiry.declared, inquiry.how
     looked_at, keep = found.record, found.last.fit.keep
     left = unexplained(found, looked_at)
     before = held_out_error(looked_at, begin, how, found.first.theta, keep)
@@ -79,11 +105,16 @@ def close_loop(
     found = inquiry.on_every_sample(found)
     first, last, record = found.first, found.last, found.record
     calibration = calibrated(last.fit)
+    doubt = doubt_of(found, how, refused)
+    if doubt is not None:
+        calibration = labelled(calibration, doubt)
     outcome = {
         "declared": ["linear", *(a.name for a in begin)],
         "noise_floor_nT": float(last.residual.scale),
     } | inquiry.told(found)
     outcome |= {"unexplained": left, "held_out": {"before": before, "after": after}}
+    if doubt is not None:
+        outcome["calibration"] = doubt.facts()
     clean = cleaned(survey, calibration, last.adopted, last.theta, record.means)
     given = common_frame(clean, calibration, "joint") | effect_variables(last.adopted, last.theta, record.means)
     before_fit = np.linalg.norm(survey.values("b_raw"), axis=2) - survey.values("total_field")[:, None]

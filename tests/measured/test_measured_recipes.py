@@ -74,10 +74,9 @@ def test_two_sensors_of_unequal_noise_are_told_apart() -> None:
 
 
 def test_quadcopter_is_refused_nine_parameters() -> None:
-    for stage in ("calibrate_joint", "close_loop"):
-        found = instead("quadcopter", stage)
-        with pytest.raises(NotEnoughData, match=r"attitudes do not determine.*never came within 45 deg"):
-            run(found, empty_survey(found))
+    found = instead("quadcopter", "calibrate_joint")
+    with pytest.raises(NotEnoughData, match=r"attitudes do not determine.*never came within 45 deg"):
+        run(found, empty_survey(found))
 
 
 def test_quadcopter() -> None:
@@ -142,3 +141,19 @@ def test_the_loop_names_the_temperature_of_the_ak09916() -> None:
     before, after = (found["held_out"][k]["total_field_rms_nT"] for k in ("before", "after"))
     assert after["AK09916"] < 0.7 * before["AK09916"], "8 degC at 500 nT each, beside 480 nT of noise"
     assert after["RM3100"] < 400, "and the better sensor stays good"
+
+
+def test_the_loop_hears_the_battery_current_where_the_flight_determines_no_calibration() -> None:
+    """docs/measured/quadcopter.md has the search over all models."""
+    import json
+
+    survey = result("loop_quadcopter", "stages.close_loop.search=[current_field,temperature_offset,supply_offset]")
+    found = json.loads(str(survey.values("loop/verdict")))
+    assert found["calibration"]["determined"] is False
+    current = next(a for a in found["adopted"] if a["error_model"] == "current_field")
+    assert "internal" in current["sensors"]
+    size = {}
+    for sensor in survey.sensors:
+        own = [c["value"] for c in current["coefficients"] if c["sensor"] == sensor]
+        size[sensor] = float(np.linalg.norm(own))
+    assert size["internal"] > 5 * size["external"]

@@ -38,6 +38,22 @@ LARGEST_SELECTION = 2_000_000  # where the attitudes of smaller ones do not suff
 
 
 @dataclass(frozen=True)
+class Posterior:
+    """What is known of C and o where a prior had to stand in for attitudes (`nominal`).
+
+    Attributes:
+        covariance, prior: (12 S, 12 S) of C Q (row by row) and o of each sensor, in the frame of `nearest_frame`;
+            with the data, and before them.
+        field: (N, 3) nT, the common field of every sample in the axes of C: the point of the sphere of the total field
+            that is nearest in the metric of the noise, so that it holds none of what the residual is made of.
+    """
+
+    covariance: Array
+    prior: Array
+    field: Array
+
+
+@dataclass(frozen=True)
 class JointFit:
     """The joint estimate before it is put into a frame.
 
@@ -46,6 +62,7 @@ class JointFit:
         plane: the common field; scalar: the calibration within its plane.
         keep: (N,) samples that were used.
         coverage: what their attitudes can determine, judged in the frame of `nearest_frame`.
+        posterior: of a fit that leans on a prior; None where the attitudes alone determine it.
     """
 
     forward: Array
@@ -54,6 +71,7 @@ class JointFit:
     scalar: ScalarFit
     keep: Mask
     coverage: Coverage
+    posterior: Posterior | None = None
 
 
 def fit_joint(raw: Array, total_field: Array, **options: Any) -> JointFit:
@@ -182,7 +200,10 @@ def calibrated(fit: JointFit) -> ArrayCalibration:
     """The fit as corrections in the frame nearest to the raw axes, with the covariance of all 12 S parameters."""
     q = nearest_frame(fit.forward)
     forward = fit.forward @ q
-    covariance = forward_covariance(fit.plane, fit.scalar, forward, q)
+    if fit.posterior is None:
+        covariance = forward_covariance(fit.plane, fit.scalar, forward, q)
+    else:
+        covariance = fit.posterior.covariance
     matrix = np.asarray(np.linalg.inv(forward), dtype=np.float64)
     size = 12 * len(forward)
     to_matrix = np.zeros((size, size))

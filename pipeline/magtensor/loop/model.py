@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtensor.calibration.joint import JointFit, fit_joint, nearest_frame
+from magtensor.calibration.nominal import Nominal, fit_nominal
 from magtensor.calibration.types import Array
 from magtensor.components import Component
 from magtensor.loop.assessment import Colours, colours_of, estimated, log_likelihood
@@ -145,6 +146,7 @@ class Fitting:
         complete: whether what the fit leaves is noise; while effects are still being searched it is not.
         searching: samples beyond all noise are believed where their neighbours agree (`stretches`): an effect may yet
             explain them.
+        nominal: what is assumed of the sensors where the attitudes do not determine them; None where they do.
     """
 
     reference_noise: float = 0.0
@@ -152,6 +154,7 @@ class Fitting:
     noise: Array | None = None
     complete: bool = False
     searching: bool = True
+    nominal: Nominal | None = None
 
 
 def joint_state(
@@ -177,7 +180,7 @@ def joint_state(
     estimate: Estimate | None = None
     terms: Terms | None = None
     for round_ in range(_MOST_ROUNDS):
-        fit = _fit(raw, reference, how, keep)
+        fit = _fit(record, raw, reference, how, keep)
         x = excitation_of(record, fit, lines)
         if not adopted:
             break
@@ -186,7 +189,7 @@ def joint_state(
             theta = [t if len(t) == e.count else np.zeros(e.count) for t, e in zip(theta, each, strict=True)]
             if any(t.any() for t in theta):
                 raw, reference = without(record, each, theta)
-                fit = _fit(raw, reference, how, keep)
+                fit = _fit(record, raw, reference, how, keep)
                 x = excitation_of(record, fit, lines)
                 each = [a.terms(x) for a in adopted]
         residual = residual_of(fit, raw, reference, how.reference_noise)
@@ -202,7 +205,7 @@ def joint_state(
         raw, reference = without(record, each, theta)
         step = np.abs(after - before) / np.sqrt(np.maximum(np.diag(estimate.covariance), 1e-300))
         if np.max(step, initial=0.0) < _SETTLED:
-            fit = _fit(raw, reference, how, keep)
+            fit = _fit(record, raw, reference, how, keep)
             x = excitation_of(record, fit, lines)
             break
     residual = residual_of(fit, raw, reference, how.reference_noise)
@@ -225,15 +228,18 @@ def _share(residual: Residual, terms: Terms, step: Array, colours: Colours) -> f
     return 0.0
 
 
-def _fit(raw: Array, reference: Array | None, how: Fitting, keep: NDArray[np.bool_] | None) -> JointFit:
-    assert reference is not None
+def _fit(record: Record, raw: Array, reference: Array | None, how: Fitting, keep: NDArray[np.bool_] | None) -> JointFit:
+    assert reference is not None and record.total_field is not None and record.quiet_field is not None
+    loud = record.total_field - record.quiet_field
 
     def fitted(believed: NDArray[np.bool_] | None) -> JointFit:
-        return fit_joint(
-            raw, reference, noise=how.noise, reference_noise=how.reference_noise,
-            worst_error=how.worst_error if how.complete else _SLACK * how.worst_error,
-            keep=believed, complete=how.complete,
-        )  # fmt: skip
+        options: dict[str, Any] = {
+            "noise": how.noise, "reference_noise": how.reference_noise, "keep": believed, "complete": how.complete,
+            "worst_error": how.worst_error if how.complete else _SLACK * how.worst_error,
+        }  # fmt: skip
+        if how.nominal is None:
+            return fit_joint(raw, reference, **options)
+        return fit_nominal(raw, reference, how.nominal, quiet_field=reference - loud, **options)
 
     fit = fitted(keep)
     if keep is not None or fit.keep.all() or not how.searching:
@@ -250,7 +256,7 @@ def require_determined(record: Record, state: State, how: Fitting) -> None:
     NotEnoughData: as in `fit_joint`.
     """
     raw, reference = without(record, [a.terms(state.excitation) for a in state.adopted], state.theta)
-    _fit(raw, reference, replace(how, complete=True), np.asarray(state.fit.keep))
+    _fit(record, raw, reference, replace(how, complete=True), np.asarray(state.fit.keep))
 
 
 def without(record: Record, each: Sequence[Terms], theta: Sequence[Array]) -> tuple[Array, Array | None]:
@@ -266,7 +272,7 @@ def without(record: Record, each: Sequence[Terms], theta: Sequence[Array]) -> tu
 def excitation_of(record: Record, fit: JointFit, lines: Sequence[float] = ()) -> Excitation:
     """Modelled outputs and field of every sample from the common field of a fit."""
     q = nearest_frame(fit.forward)
-    b = (fit.plane.coordinates(record.raw) - fit.scalar.offset) @ fit.scalar.matrix.T
+    b = fit.scalar.field(fit.plane.coordinates(record.raw)) if fit.posterior is None else fit.posterior.field
     output = np.einsum("sij,nj->nsi", fit.forward, b) + fit.offset
     common = np.repeat((b @ q)[:, None], len(record.sensors), axis=1)
     return record.excitation(output, common, lines)

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtensor.calibration.joint import JointFit
+from magtensor.calibration.nominal import least
 from magtensor.calibration.types import Array
 from magtensor.loop.terms import Terms
 from magtensor.loop.turned import SlowModes
@@ -95,14 +96,21 @@ def residual_of(fit: JointFit, raw: Array, total_field: Array | None, reference_
     size = len(plane.noise)
     b = (plane.coordinates(used) - scalar.offset) @ scalar.matrix.T
     length = np.linalg.norm(b, axis=1)
-    u = b / length[:, None]
+    u = b / length[:, None] if fit.posterior is None else _direction(fit.posterior.field[keep])
     g = u @ scalar.matrix
     spread = np.sqrt(np.einsum("ni,ni->n", g, g) + reference_noise**2)
     unit = float(length.mean())
     affine = np.column_stack([b / unit, np.ones(len(b))])
+    across = plane.residual(used) if size > 3 else None
     along = None if total_field is None else (length - total_field[keep]) / spread
+    if fit.posterior is not None:
+        # the prior holds C and o where the residual is not the least there is
+        affine[:, :3] = fit.posterior.field[keep] / unit
+        inner = np.einsum("ni,nj->nij", g / spread[:, None], affine).reshape(len(b), 12)
+        along = None if along is None else least(along[:, None], inner)[:, 0]
+        across = None if across is None else least(across, affine)
     return Residual(
-        across=plane.residual(used) if size > 3 else None,
+        across=across,
         along=along,
         affine=affine,
         inner=np.einsum("ni,nj->nij", g / spread[:, None], affine).reshape(len(b), 12),
@@ -113,6 +121,11 @@ def residual_of(fit: JointFit, raw: Array, total_field: Array | None, reference_
         samples=keep,
         slow_modes=SlowModes(g / spread[:, None]),
     )
+
+
+def _direction(field: Array) -> Array:
+    out: Array = field / np.linalg.norm(field, axis=1, keepdims=True)
+    return out
 
 
 def taken_off(residual: Residual, terms: Terms, theta: Array) -> Residual:

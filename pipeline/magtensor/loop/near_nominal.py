@@ -1,0 +1,96 @@
+"""An inquiry where the attitudes determine no calibration: with sensors taken near nominal, and saying so."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+from magtensor.calibration.nominal import Nominal
+from magtensor.calibration.types import ArrayCalibration
+from magtensor.calibration.undetermined import Undetermined, undetermined
+from magtensor.errors import DataError
+from magtensor.loop.inquiry import Inquiry
+from magtensor.loop.model import Fitting, require_determined
+from magtensor.loop.search import Search
+
+Inquire = Callable[[Fitting], Inquiry]
+
+
+def settled(inquire: Inquire, how: Fitting, nominal: Nominal | None) -> tuple[Inquiry, Search, str]:
+    """An inquiry that ends with a determined calibration, or else one with a prior; and what it found.
+
+    Parameters
+    ----------
+    inquire: makes an inquiry, with its decisions, for a way of fitting.
+    nominal: the prior; None refuses a survey that needs it.
+
+    Returns
+    -------
+    Beside the two, why the fit without a prior was refused; "" where it was not.
+
+    Raises
+    ------
+    DataError: there is no calibration, and a prior is not wanted or does not help.
+    """
+
+    def ended(how: Fitting) -> tuple[Inquiry, Search]:
+        inquiry = inquire(how)
+        found = inquiry.found()
+        require_determined(found.record, found.last, how)
+        return inquiry, found
+
+    try:
+        return *ended(how), ""
+    except DataError as error:  # of too few attitudes, or of what these make of a strong effect
+        refusal = error
+    if nominal is None or how.nominal is not None:
+        raise refusal
+    try:
+        return *ended(replace(how, nominal=nominal)), refusal.what
+    except DataError as error:
+        raise _refused(refusal, error) from error
+
+
+def begun(inquire: Inquire, how: Fitting, nominal: Nominal | None) -> Inquiry:
+    """An inquiry whose first fit can be made, with a prior if need be.
+
+    Parameters, raises: as `settled`.
+    """
+    inquiry = inquire(how)
+    try:
+        assert inquiry.first is not None
+        return inquiry
+    except DataError as error:
+        refusal = error
+    if nominal is None:
+        raise refusal
+    inquiry = inquire(replace(how, nominal=nominal))
+    try:
+        assert inquiry.first is not None
+        return inquiry
+    except DataError as error:
+        raise _refused(refusal, error) from error
+
+
+def _refused(first: DataError, second: DataError) -> DataError:
+    also = f"with sensors taken near nominal: {second.what}"
+    hint = "; ".join(p for p in (first.hint, also, second.hint) if p)
+    return type(first)(first.what, where=first.where or second.where, hint=hint)
+
+
+def doubt_of(found: Search, how: Fitting, why: str) -> Undetermined | None:
+    """What a calibration leaves open; None where its attitudes determine it."""
+    if how.nominal is None:
+        return None
+    fit = found.last.fit
+    return undetermined(fit, how.nominal, found.record.sensors, found.last.excitation.field[fit.keep, 0], why)
+
+
+def labelled(calibration: ArrayCalibration, doubt: Undetermined) -> ArrayCalibration:
+    """The calibration, saying of itself what is left open."""
+    facts: dict[str, float | str] = {"undetermined": doubt.sentence, "worst_error_nT": doubt.worst_error}
+    return replace(
+        calibration,
+        unobservable=(*calibration.unobservable, *doubt.words),
+        diagnostics={**calibration.diagnostics, **facts},
+    )

@@ -1,0 +1,94 @@
+"""The joint fit with sensors near nominal: derivatives, the prior, its covariance, and what it must not invent."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from level_cases import TOTAL, flight
+
+from magtensor.calibration.joint import calibrated, fit_joint, nearest_frame
+from magtensor.calibration.nominal import Nominal, _Data, fit_nominal
+from magtensor.errors import DataError, NotEnoughData
+from magtensor.loop.residual import residual_of
+
+
+@pytest.mark.parametrize("sensors", [1, 2, 4])
+def test_scores_vanish_at_the_truth_and_change_as_they_say(sensors: int) -> None:
+    flown = flight(1, sensors, count=300, noise=0.0)
+    data = _Data(flown.raw.reshape(300, -1), np.full(300, TOTAL), TOTAL, np.linspace(5.0, 9.0, 3 * sensors), 3.0)
+    true = np.concatenate([flown.forward, flown.offset[:, :, None] / TOTAL], axis=2).reshape(-1, 4)
+    weights = (0.7, 0.3)
+    score, change, covariance = data.equations(data.at(true), weights)
+    size = np.sqrt(np.diag(covariance))
+    assert np.max(np.abs(score) / size) < 1e-3
+    assert np.linalg.eigvalsh(covariance / np.outer(size, size))[0] > -1e-9
+    rng = np.random.default_rng(2)
+    for way in rng.standard_normal((5, 3 * sensors, 4)):
+        there, back = (data.equations(data.at(true + step * way), weights)[0] for step in (1e-6, -1e-6))
+        expected = -change @ way.ravel()
+        assert np.max(np.abs((there - back) / 2e-6 - expected)) < 1e-3 * np.max(np.abs(expected))
+
+
+def test_a_survey_that_determines_it_is_fitted_alike_with_and_without_the_prior() -> None:
+    rng = np.random.default_rng(3)
+    u = rng.standard_normal((2000, 3))
+    field = TOTAL * u / np.linalg.norm(u, axis=1, keepdims=True)
+    forward = np.eye(3) + 0.03 * rng.standard_normal((3, 3, 3))
+    raw = np.einsum("sij,nj->nsi", forward, field) + 5.0 * rng.standard_normal((2000, 3, 3))
+    plain, near = fit_joint(raw, np.full(2000, TOTAL)), fit_nominal(raw, np.full(2000, TOTAL), Nominal())
+    assert plain.posterior is None
+    a, b = calibrated(plain), calibrated(near)
+    std = np.sqrt(np.diag(a.covariance))
+    apart = np.concatenate([(a.matrix - b.matrix).reshape(3, 9), a.offset - b.offset], axis=1).ravel()
+    assert np.max(np.abs(apart) / std) < 0.2
+    np.testing.assert_allclose(np.sqrt(np.diag(b.covariance)), std, rtol=0.3)
+
+
+@pytest.mark.parametrize(("sensors", "tilt"), [(2, 1.5), (2, 0.01), (4, 0.3)])
+def test_errors_are_as_large_as_the_covariance_says(sensors: int, tilt: float) -> None:
+    """Calibrations drawn from the prior itself, over flights of which some parameters are never seen."""
+    nominal = Nominal(0.04, float(np.degrees(0.04)), 0.03)
+    found = []
+    for seed in range(20):
+        flown = flight(100 + seed, sensors, tilt_deg=tilt, count=400, scale=0.04, offset=0.03 * TOTAL)
+        fit = fit_nominal(flown.raw, np.full(400, TOTAL), nominal)
+        assert fit.posterior is not None
+        off = fit.forward @ nearest_frame(fit.forward) - flown.forward @ nearest_frame(flown.forward)
+        error = np.concatenate([off.reshape(sensors, 9), fit.offset - flown.offset], axis=1).ravel()
+        found.append(error / np.sqrt(np.diag(fit.posterior.covariance)))
+    each = np.sqrt(np.mean(np.square(found), axis=0))
+    assert each.min() > 0.45 and each.max() < 1.55, "of 20: chi-square at one in ten thousand"
+    assert 0.7 < np.sqrt(np.mean(np.square(found))) < 1.2
+
+
+@pytest.mark.parametrize("tilt", [0.0, 0.02, 3.0])
+def test_sensors_off_nominal_leave_noise_and_nothing_else(tilt: float) -> None:
+    for seed in range(3):
+        flown = flight(20 + seed, 2, noise=1.0, tilt_deg=max(tilt, 1e-9), scale=0.07, offset=3000.0)
+        total_field = np.full(len(flown.raw), TOTAL)
+        left = residual_of(fit_nominal(flown.raw, total_field, Nominal()), flown.raw, total_field)
+        assert left.across is not None and left.along is not None
+        slow = np.column_stack([left.across, left.along]).reshape(30, 50, -1).mean(axis=1)
+        assert 0.9 < left.square() < 1.1
+        assert np.mean(slow[:, -1] ** 2) * 50 < 2.0, "what is left is not slow"
+        assert np.sum(slow[:, :-1] ** 2) / 30 / 3 * 50 < 2.0
+
+
+def test_a_strong_current_does_not_take_the_plane() -> None:
+    """2000 nT on one compass where the field moves by 500 along z: the prior says which is the field."""
+    flown = flight(31, 2, tilt_deg=0.7, effect=np.array([200.0, -300.0, 900.0]))
+    fit = fit_nominal(flown.raw, np.full(len(flown.raw), TOTAL), Nominal(), complete=False)
+    assert np.abs(fit.forward - np.eye(3)).max() < 0.3
+    assert fit.posterior is not None
+    assert np.sqrt(np.mean((fit.posterior.field - flown.field) ** 2)) < 0.1 * TOTAL
+
+
+def test_what_is_far_from_nominal_is_refused() -> None:
+    flown = flight(5)
+    total_field = np.full(len(flown.raw), TOTAL)
+    with pytest.raises(DataError, match=r"sensor 2 is not near nominal: the offset of its x output"):
+        fit_nominal(flown.raw + np.array([[0.0, 0, 0], [60_000.0, 0, 0]]), total_field, Nominal())
+    with pytest.raises(DataError, match="not near nominal"):
+        fit_nominal(flown.raw * np.array([[1.0, 1.0, 1.0], [1.0, -1.0, 1.0]]), total_field, Nominal())
+    with pytest.raises(NotEnoughData, match="40 samples"):
+        fit_nominal(flown.raw[:40], total_field[:40], Nominal())
