@@ -242,6 +242,7 @@ def apply_and_refine(
         attribute `rotation_refined` of `calibrated/b` says what was done.
     """
     from magtensor.calibrated import corrected, require_positions, require_sensors, restored
+    from magtensor.effect_errors import taken_off
     from magtensor.loop.stored import cleaned, stored_effects
     from magtensor.platform_frame import as_fitted, with_refined_rotation
     from magtensor.tensor.elements import five
@@ -255,7 +256,8 @@ def apply_and_refine(
         if "calibration/position" in calibration:
             require_positions(survey, calibration.values("calibration/position"), str(path))
         fitted = restored(calibration)
-        survey = cleaned(survey, as_fitted(calibration, fitted), *stored_effects(calibration, planned.registry))
+        adopted, theta, means = stored_effects(calibration, planned.registry)
+        before, survey = survey, cleaned(survey, as_fitted(calibration, fitted), adopted, theta, means)
         survey = survey.merged(_named(corrected(fitted, survey), calibration))
         if refine_rotation:
             survey, turned = with_refined_rotation(survey, calibration, fitted)
@@ -264,7 +266,8 @@ def apply_and_refine(
             b, noise = survey.values("calibrated/b"), calibration.values("calibration/noise_std")
             position = calibration.values("calibration/position")
             assembly = stored_assembly(calibration)
-            survey = survey.merged(assembled(assembly, b, position, noise, fitted, refinement))
+            off = taken_off(calibration, fitted, before, survey, adopted, means)
+            survey = survey.merged(assembled(assembly, b, position, noise, fitted, refinement, off))
     elif refine_rotation:
         raise DataError(
             "it calibrates no sensors, so there is no common frame to refine",

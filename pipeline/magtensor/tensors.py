@@ -13,7 +13,7 @@ from magtensor.survey.model import AXES, Survey, Variable
 from magtensor.tensor.assembly import Assembly, unconstrained_assembly
 from magtensor.tensor.elements import FIVE_OF_NINE, NINE_OF_FIVE, closure, five, full
 from magtensor.tensor.invariants import Invariants, invariants, invariants_std
-from magtensor.tensor.uncertainty import component_covariance, tensor_std
+from magtensor.tensor.uncertainty import TakenOff, component_covariance, tensor_std
 
 FIVE = ("xx", "xy", "xz", "yy", "yz")
 TENSOR = ("time", "row", "column")
@@ -68,6 +68,7 @@ def assembled(
     noise: Array,
     calibration: ArrayCalibration,
     refinement: tuple[Array, Array, Array] | None = None,
+    taken_off: TakenOff | None = None,
 ) -> dict[str, Variable]:
     """Tensor, mean field, invariants and their standard deviations at every sample.
 
@@ -78,6 +79,7 @@ def assembled(
         noise: (S, 3) nT white noise of b; NaN where unknown, and the deviations then hold the calibration's part alone.
         calibration: with its covariance.
         refinement: H (5, 5), D (5,) nT/m of Sui 2017 eq. 9 and their covariance (30, 30), where there is one.
+        taken_off: the errors of effects that were corrected before, where they are known.
     """
     symmetric = assembly.symmetrised()
     tensor = symmetric.apply(b)
@@ -86,12 +88,15 @@ def assembled(
     if refinement is not None:
         symmetric = replace(symmetric, gain=_refined_gain(refinement[0], symmetric.gain))
         tensor = symmetric.apply(b) + full(refinement[1])
-    std = tensor_std(symmetric, b, noise_covariance=covariance, calibration=calibration)
+    std = tensor_std(symmetric, b, noise_covariance=covariance, calibration=calibration, taken_off=taken_off)
     values = np.stack(invariants(tensor), axis=1)
     deviations = np.empty_like(values)
     for start in range(0, len(b), _CHUNK):
         part = slice(start, start + _CHUNK)
-        each = component_covariance(symmetric, b[part], noise_covariance=covariance, calibration=calibration)
+        each = component_covariance(
+            symmetric, b[part], noise_covariance=covariance, calibration=calibration,
+            taken_off=None if taken_off is None else taken_off.at(part),
+        )  # fmt: skip
         if refinement is not None:
             own = _refinement_covariance(measured[part], refinement[2])
             each += own

@@ -35,6 +35,8 @@ def verdict(survey: Survey, verify: dict[str, Any] | None = None) -> dict[str, A
         },
         "error": {"fit": survey_block(survey)},
     }
+    if "calibration/effects" in survey:
+        found["declared"] += [json.loads(str(text))["error_model"] for text in survey.values("calibration/effects")]
     if "loop/verdict" in survey:
         loop = json.loads(str(survey.values("loop/verdict")))
         found["error"]["held_out"] = loop.pop("held_out")

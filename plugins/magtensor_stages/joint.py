@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from magtensor import NotEnoughData, UsageError, stage
+from magtensor import DataError, ErrorModelsChoice, NotEnoughData, UsageError, stage
 from magtensor.calibration.coverage import WORST_ERROR
-from magtensor.components import Declares
+from magtensor.components import Component, Declares
 from magtensor.survey.flags import flag_ranges
 from magtensor_methods.scalar_options import WorstError
 from magtensor_stages import joint_surveys
@@ -59,6 +59,11 @@ OffsetTaken = Annotated[
 ]
 
 
+ALONE = (
+    "calibrate_joint: error_models are fitted to one survey with a measured total field and without a vector reference"
+)
+
+
 def declares(options: Mapping[str, Any]) -> Declares:
     """What is needed depends on what is known of the field."""
     field = _field(options["total_field"], options["total_field_nT"], options["vector_reference"])
@@ -67,9 +72,12 @@ def declares(options: Mapping[str, Any]) -> Declares:
     needs += ["attitude", "reference/world_field"] if field.vector else []
     always = tuple(p for p in COMMON if not p.startswith("residual/"))
     gives = COMMON if "total_field" in needs else always
+    uses: tuple[str, ...] = ("total_field", "segment", "attitude", "reference/world_field")
+    if options["error_models"]:
+        uses = ("*", "reference/time", "reference/total_field")
     return Declares(
         tuple(needs),
-        ("total_field", "segment", "attitude", "reference/world_field"),
+        uses,
         gives,
         ("residual/contrast", "residual/total_field", "residual/total_field_before", "good"),
     )
@@ -101,7 +109,7 @@ def calibrate_recording(
 
 _PLAIN: dict[str, Any] = {
     "total_field": "measured", "total_field_nT": None, "vector_reference": False, "attitude_std_deg": None,
-    "offsets": "own", "offset_of": "this",
+    "offsets": "own", "offset_of": "this", "error_models": {},
 }  # fmt: skip
 
 
@@ -118,13 +126,16 @@ def calibrate_joint(
     attitude_std_deg: AttitudeStd = None,
     offsets: OffsetsOf = "own",
     offset_of: OffsetTaken = "this",
+    error_models: ErrorModelsChoice = (),
 ) -> dict[str, Any]:
     """Calibrate all sensors and the reference in one fit: maximum likelihood over every C and o, the unknown field of
     each sample eliminated.
 
     One common frame, the nearest to the raw axes, or the platform's with a vector reference; the covariance of all
     parameters. Samples that no noise explains are flagged. Further surveys that the recipe names (`survey: {with:
-    [...]}`) are fitted together with this one. A recording of any length is read once (`--memory`).
+    [...]}`) are fitted together with this one. `error_models` names effects whose coefficients are fitted together with
+    C and o, each with its settings, without asking whether the data want them (`close_loop` asks); what is not set has
+    the error model's default. A recording of any length is read once (`--memory`).
     """
     from magtensor.calibration.recording import InMemory
 
@@ -132,6 +143,10 @@ def calibrate_joint(
     several = survey.source is not None and bool(survey.source.further_files())
     if offset_of == "mean" and (not several or offsets == "common"):
         raise UsageError("calibrate_joint: offset_of: mean needs further surveys with offsets of their own")
+    if error_models:
+        if several or field.vector or not field.measured:
+            raise UsageError(ALONE)
+        return _with_error_models(survey, dict(error_models), reference_noise_nT, robust, worst_error)
     if several or field.vector or field.kind.startswith("per_"):
         how = (reference_noise_nT, attitude_std_deg, robust, worst_error)
         calibration, extra, doubted = _from_surveys(survey, field, how, offsets == "common", offset_of == "mean")
@@ -155,10 +170,7 @@ def calibrate_joint(
         dims, values, attributes = given["calibration/matrix"]
         given["calibration/matrix"] = (dims, values, dict(attributes) | {"offset_of": offsets_of})
         del given["offset_of"]
-    if doubted.any():
-        given["good"] = (("time", "sensor"), survey.good_by_sensor & ~doubted[:, None], {"long_name": "may be used"})
-        given["flags"] = flag_ranges(survey.time, doubted, by="calibrate_joint", reason=DOUBTED)
-    return given
+    return given | _flagged(survey, doubted)
 
 
 ALL_THE_SAME = "close_loop looks for effects all the same, with sensors taken near nominal (undetermined: nominal)"
@@ -184,6 +196,61 @@ def _from_recording(
         hint = "; ".join(p for p in (error.hint, ALL_THE_SAME) if p)
         raise NotEnoughData(error.what, where=error.where, hint=hint) from error
     return calibrated(fit), usable & ~fit.keep
+
+
+def _with_error_models(
+    survey: Survey,
+    chosen: Mapping[str, tuple[Component, Mapping[str, Any]]],
+    reference_noise: float,
+    robust: bool,
+    worst_error: float,
+) -> dict[str, Any]:
+    """The variables of a survey whose outputs and total field hold declared effects."""
+    from magtensor.calibrated import MATRIX_ENTRIES, OFFSET_ENTRIES
+    from magtensor.effect_errors import coefficient_variables, with_coefficients
+    from magtensor.loop.model import Adopted, Fitting, joint_state, require_determined
+    from magtensor.loop.needs import missing
+    from magtensor.loop.record import record_of
+    from magtensor.loop.stored import cleaned, effect_variables
+
+    record, where = record_of(survey), str(survey.attributes.get("source", ""))
+    if not len(record.time):
+        raise NotEnoughData("no sample has all sensors in use and a total field", where=where)
+    adopted = [Adopted(component, settings) for component, settings in chosen.values()]
+    for one in adopted:
+        if lacking := missing(one.component, record.excitation(record.raw, record.raw)):
+            needs = " and ".join(lacking)
+            raise DataError(f"the error model {one.name} needs {needs}, which this survey does not show", where=where)
+    how = Fitting(reference_noise, worst_error, searching=False)
+    with naming(survey):
+        state = joint_state(record, adopted, how, keep=None if robust else np.ones(len(record.time), dtype=bool))
+        require_determined(record, state, how)
+    found = with_coefficients(state)
+    calibration = found.calibration
+    if found.open:
+        words = f"{found.open} of {len(found.values)} directions of the coefficients of {', '.join(chosen)}"
+        free = (*calibration.unobservable, f"{words}: no data show them, and they were left zero")
+        calibration = replace(calibration, unobservable=free)
+    clean = cleaned(survey, calibration, adopted, state.theta, record.means)
+    given = common_frame(clean, calibration, "joint") | effect_variables(adopted, state.theta, record.means)
+    parameters = [f"{s}:{e}" for s in survey.sensors for e in (*MATRIX_ENTRIES, *OFFSET_ENTRIES)]
+    given |= coefficient_variables(found, parameters)
+    before = np.linalg.norm(survey.values("b_raw"), axis=2) - survey.values("total_field")[:, None]
+    given["residual/total_field_before"] = (("time", "sensor"), before, {"units": "nT", "long_name": "|b_raw| - F"})
+    doubted = np.zeros(len(survey.time), dtype=bool)
+    doubted[record.samples[~state.fit.keep]] = True
+    return given | _flagged(survey, doubted)
+
+
+def _flagged(survey: Survey, doubted: np.ndarray) -> dict[str, Any]:
+    """The samples (N,) that no noise explains."""
+    if not doubted.any():
+        return {}
+    good = survey.good_by_sensor & ~doubted[:, None]
+    return {
+        "good": (("time", "sensor"), good, {"long_name": "may be used"}),
+        "flags": flag_ranges(survey.time, doubted, by="calibrate_joint", reason=DOUBTED),
+    }
 
 
 def _without_reference(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,25 @@ Array = NDArray[np.float64]
 _UPPER = np.array([0, 1, 2, 4, 5, 8])  # of the nine elements row by row; the others mirror them
 _UPPER_OF_NINE = np.array([0, 1, 2, 1, 3, 4, 2, 4, 5])
 _CHUNK = 16384  # samples at a time: a few MB of scratch for any array
+
+
+@dataclass(frozen=True)
+class TakenOff:
+    """Disturbances that were taken off the raw outputs, with coefficients of uncertain size.
+
+    Attributes:
+        series: (N, K) nT per unit of a coefficient.
+        response: (K, 3 S, P), which series a coefficient adds to which output.
+        covariance: (12 S + P,) squared, of the calibration's parameters and the coefficients together.
+    """
+
+    series: Array
+    response: Array
+    covariance: Array
+
+    def at(self, part: slice) -> TakenOff:
+        """At some of the samples."""
+        return replace(self, series=self.series[part])
 
 
 def noise_covariance_of_components(assembly: Assembly, noise_covariance: Array) -> Array:
@@ -45,6 +65,7 @@ def component_covariance(
     *,
     noise_covariance: Array | None = None,
     calibration: ArrayCalibration | None = None,
+    taken_off: TakenOff | None = None,
 ) -> Array:
     """Covariance (N, 5, 5) in (nT/m)^2 of the five components at every sample, noise and calibration added.
 
@@ -55,6 +76,7 @@ def component_covariance(
     b : (N, S, 3) nT, the calibrated fields.
     noise_covariance : (3 S, 3 S) or (S, 3, 3) nT^2, of the calibrated fields.
     calibration : the correction that made `b`, with its covariance. NaN in it makes the result NaN.
+    taken_off : effects that were corrected before, at the same samples; its covariance then takes the other's place.
     """
     fields = assembly.checked_fields(b)
     out = np.zeros((len(fields), 5, 5))
@@ -62,7 +84,7 @@ def component_covariance(
         out += noise_covariance_of_components(assembly, noise_covariance)
     if calibration is not None:
         upper = np.triu_indices(5)
-        for part, values in _calibration_terms(_five_rows(assembly), upper, fields, calibration):
+        for part, values in _calibration_terms(_five_rows(assembly), upper, fields, calibration, taken_off):
             out[part, upper[0], upper[1]] += values
             mirrored = upper[0] != upper[1]
             out[part, upper[1][mirrored], upper[0][mirrored]] += values[:, mirrored]
@@ -75,6 +97,7 @@ def tensor_std(
     *,
     noise_covariance: Array | None = None,
     calibration: ArrayCalibration | None = None,
+    taken_off: TakenOff | None = None,
 ) -> Array:
     """Standard deviation (N, 3, 3) in nT/m of every element at every sample, noise and calibration added.
 
@@ -89,7 +112,7 @@ def tensor_std(
         copies = _UPPER_OF_NINE if assembly.symmetric else np.arange(9)
         each = np.arange(len(distinct))
         rows = _nine_rows(assembly)[distinct]
-        for part, values in _calibration_terms(rows, (each, each), fields, calibration):
+        for part, values in _calibration_terms(rows, (each, each), fields, calibration, taken_off):
             variance[part] += np.maximum(values, 0)[:, copies]  # rounding can make a zero variance negative
     out: Array = np.sqrt(variance).reshape(-1, 3, 3)
     return out
@@ -106,12 +129,17 @@ def _five_rows(assembly: Assembly) -> Array:
 
 
 def _calibration_terms(
-    rows: Array, pairs: tuple[NDArray[np.int_], ...], fields: Array, calibration: ArrayCalibration
+    rows: Array,
+    pairs: tuple[NDArray[np.int_], ...],
+    fields: Array,
+    calibration: ArrayCalibration,
+    taken_off: TakenOff | None,
 ) -> Iterator[tuple[slice, Array]]:
     """Yield (slice of samples, (n, pairs) covariance of rows[p] b and rows[q] b that the calibration causes).
 
     With b = M (m - o), d(row b) is linear in z = (m - o, 1) and in the parameters: row' db = z' E dp. So the
-    covariance of two rows is the quadratic form z' (E_p C E_q') z, of one small matrix for all samples.
+    covariance of two rows is the quadratic form z' (E_p C E_q') z, of one small matrix for all samples. A disturbance
+    taken off with a coefficient of its own lengthens z by its series and the parameters by the coefficient.
     """
     sensors = fields.shape[1]
     size = PARAMETERS_PER_SENSOR * sensors
@@ -124,11 +152,20 @@ def _calibration_terms(
         )
     inverse = np.linalg.inv(calibration.matrix)
     influence = np.stack([_influence(row.reshape(sensors, 3), calibration.matrix) for row in rows])
+    if taken_off is not None:
+        covariance = taken_off.covariance
+        turned = np.einsum("rsi,sij->rsj", rows.reshape(len(rows), sensors, 3), calibration.matrix)
+        own = -np.einsum("ro,kop->rkp", turned.reshape(len(rows), -1), taken_off.response)
+        influence = np.block([
+            [influence, np.zeros((*influence.shape[:2], own.shape[2]))],
+            [np.zeros((*own.shape[:2], influence.shape[2])), own],
+        ])  # fmt: skip
     forms = np.stack([influence[p] @ covariance @ influence[q].T for p, q in zip(*pairs, strict=True)])
     for start in range(0, len(fields), _CHUNK):
         part = slice(start, start + _CHUNK)
         raw = np.einsum("sij,nsj->nsi", inverse, fields[part])
-        z = np.concatenate([raw.reshape(len(raw), -1), np.ones((len(raw), 1))], axis=1)
+        parts = [raw.reshape(len(raw), -1), np.ones((len(raw), 1))]
+        z = np.concatenate(parts if taken_off is None else [*parts, taken_off.series[part]], axis=1)
         yield part, np.stack([np.einsum("np,np->n", z @ form, z) for form in forms], axis=1)
 
 
