@@ -13,6 +13,7 @@ from magtensor.calibration.surveys.corrections import calibrated_surveys
 from magtensor.calibration.surveys.directions import sighting
 from magtensor.calibration.surveys.fit import fit_surveys
 from magtensor.errors import DataError, NotEnoughData
+from magtensor.frame.calibration_errors import errors_of
 
 
 @pytest.mark.parametrize(
@@ -82,6 +83,27 @@ def test_the_common_rotation_is_determined() -> None:
     one = np.radians(0.5) / np.sqrt(2 * 600 / 3)
     assert np.sqrt(np.mean(np.square(angles))) < 2.5 * one
     assert calibrated_surveys(fit_surveys(surveys(0, case).samples)).common.frame.startswith("platform")
+
+
+def test_an_attitude_that_drifts_is_believed_less() -> None:
+    """Errors alike over a hundred samples: the rotation is a hundred times less certain in variance, and said to be."""
+    ratios, widened = [], []
+    for seed in range(30):
+        truth = surveys(seed, Case(samples=(6000,), attitude_deg=0.05))
+        assert truth.samples.direction is not None
+        slow = np.radians(0.3) * np.repeat(np.random.default_rng(seed).standard_normal((60, 3)), 100, axis=0)
+        known = truth.samples.direction + np.cross(slow, truth.samples.direction)
+        known /= np.linalg.norm(known, axis=1, keepdims=True)
+        fit = fit_surveys(replace(truth.samples, direction=known))
+        found = calibrated_surveys(fit).common
+        errors_ = errors_of(found).common @ errors_of(found).common.T  # (3, 3) of the common rotation
+        turn = np.mean(found.matrix @ truth.forward, axis=0)
+        vector = 0.5 * np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
+        ratios.append(vector @ np.linalg.solve(errors_, vector) / 3)
+        widened.append(fit.attitude_excess)
+    assert np.median(widened) > 30.0
+    # of 90 squares, the widening itself known from 20 parts
+    assert 0.5 < np.mean(ratios) < 1.8
 
 
 def test_a_poor_attitude_does_not_attenuate_the_matrix() -> None:

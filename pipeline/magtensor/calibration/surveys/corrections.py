@@ -85,6 +85,7 @@ def calibrated_surveys(fit: SurveysFit) -> SurveysCalibration:
     free: tuple[str, ...] = ("one rotation of the whole array: the frame nearest to the raw axes was chosen",)
     if fit.attitude_std is not None:
         diagnostics["attitude_std_deg"] = float(np.degrees(fit.attitude_std))
+        diagnostics["attitude_excess"] = fit.attitude_excess
         frame, free = "platform (by the attitude and the known field)", ()
     with_first = with_offset(len(matrix), np.eye(len(fit.offset))[0])
     common = ArrayCalibration(matrix, fit.offset[0], with_first @ covariance @ with_first.T, frame, free, diagnostics)

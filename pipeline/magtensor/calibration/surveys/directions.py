@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from magtensor.calibration.types import Array
+from magtensor.frame.sources import edges_of, excess
 
 
 @dataclass(frozen=True)
@@ -79,6 +80,22 @@ def across(seen: Sighting, part: slice, b: Array, along: Array) -> Across:
     by_length = np.einsum("nik,ni->nk", root, v) + coupling
     slope = root.swapaxes(1, 2) - by_length[:, :, None] * unit[:, None]
     return Across(residual, slope)
+
+
+def disagreement(seen: Sighting, b: Array, total_field: Array) -> float:
+    """How much more the parts of a record disagree about the rotation of everything than independent errors of the
+    attitude let them: a ratio of variances, one where that may be chance. An attitude that drifts shows here.
+
+    Parameters
+    ----------
+    b: (N, 3) nT at the minimum.
+    """
+    side = across(seen, slice(None), b, np.linalg.norm(b, axis=1) - total_field)
+    turning = np.cross(b[:, None], side.slope)  # (N, 2, 3): derivative of either residual with a rotation vector
+    gradient = np.einsum("nk,nki->ni", side.residual, turning)
+    parts = edges_of(np.ones(len(b)))
+    scatter = np.einsum("nki,nkj->ij", turning, turning)
+    return excess(np.stack([gradient[p].sum(axis=0) for p in parts]), scatter)
 
 
 def attitude_std(seen: Sighting, b: Array, total_field: Array, free: int) -> float:

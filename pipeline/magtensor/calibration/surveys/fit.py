@@ -20,7 +20,7 @@ from magtensor.calibration.maximum_likelihood import along
 from magtensor.calibration.types import Array, Mask
 from magtensor.errors import DataError, NotEnoughData
 
-from .directions import across, attitude_std, sighting
+from .directions import across, attitude_std, disagreement, sighting
 from .samples import Samples
 from .start import on_ellipsoid, on_known_field
 from .sums import Found, InPlane, minimised, with_scale
@@ -42,6 +42,7 @@ class SurveysFit:
         keep: (N,) samples that were used.
         coverage: of all surveys together.
         attitude_std: rad; None without known directions.
+        attitude_excess: by how much the variance of what the attitudes tell was widened (`directions.disagreement`).
     """
 
     forward: Array
@@ -52,6 +53,7 @@ class SurveysFit:
     keep: Mask
     coverage: Coverage
     attitude_std: float | None = None
+    attitude_excess: float = 1.0
 
     @property
     def chi2_along(self) -> float:
@@ -185,6 +187,7 @@ def _fitted(
     data = InPlane(plane.coordinates(centred), centre, used.total_field, used.level, reference_noise)
     shifts = (means.reshape(len(means), -1) / plane.noise) @ plane.basis
     std: float | None = None
+    wider = 1.0
     if used.direction is None:
         try:
             found = on_ellipsoid(data, shifts)
@@ -193,16 +196,17 @@ def _fitted(
             require_coverage(coverage(nominal, used.total_field))
             raise
     else:
-        data, found, std = _sighted(data, used.direction, attitude)
+        data, found, std, wider = _sighted(data, used.direction, attitude)
     forward = (plane.basis @ np.linalg.inv(found.matrix) * plane.noise[:, None]).reshape(-1, 3, 3)
     offset = means + (found.centres @ plane.basis.T * plane.noise).reshape(means.shape)
     from .judged import judged
 
-    return SurveysFit(forward, offset, plane, data, found, keep, judged(data, found, worst_error), std)
+    return SurveysFit(forward, offset, plane, data, found, keep, judged(data, found, worst_error), std, wider)
 
 
-def _sighted(data: InPlane, direction: Array, known_std: float | None) -> tuple[InPlane, Found, float]:
-    """The fit with known directions; their standard deviation is found from what they leave, unless it is given."""
+def _sighted(data: InPlane, direction: Array, known_std: float | None) -> tuple[InPlane, Found, float, float]:
+    """The fit with known directions; their standard deviation is found from what they leave, unless it is given. They
+    weigh less by as much as parts of the record disagree."""
     matrix, centres = on_known_field(data, direction)
     std = _ROUGH if known_std is None else known_std
     for _ in range(_ROUNDS):
@@ -217,7 +221,13 @@ def _sighted(data: InPlane, direction: Array, known_std: float | None) -> tuple[
             std = attitude_std(seen, data.fields(matrix, centres), found.sums.total_field, 6)
         if abs(std - before) <= _SETTLED * std and moved < 1e-6:
             break
-    return data, found, std
+    assert data.sighting is not None
+    wider = disagreement(data.sighting, data.fields(matrix, centres), found.sums.total_field)
+    if wider > 1.0:
+        root, coupling = data.sighting.root / np.sqrt(wider), data.sighting.coupling / np.sqrt(wider)
+        data = replace(data, sighting=replace(data.sighting, root=root, coupling=coupling))
+        found = minimised(data, matrix, centres)
+    return data, found, std, wider
 
 
 def _scaled(fit: SurveysFit, factor: float) -> SurveysFit:
