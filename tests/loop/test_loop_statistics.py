@@ -128,6 +128,17 @@ def with_line(seed: int, amplitude: float, frequency: float = 0.083) -> tuple[St
     return linear_state(record), record
 
 
+def test_few_readings_of_a_noisy_base_station_hold_no_field_but_their_trend() -> None:
+    """Of two dozen frequencies one is always quiet by chance; the others were then taken for signal."""
+    at = np.arange(24.0)
+    kept = []
+    for seed in range(200):
+        noise = np.random.default_rng(seed).standard_normal(24)
+        quiet = quieted(50_000.0 + noise, CLEARANCE)
+        kept.append(np.var(quiet - np.polynomial.Polynomial.fit(at, quiet, 1)(at)) / np.var(noise))
+    assert np.mean(kept) < 0.01
+
+
 def test_a_line_is_found_and_noise_has_none() -> None:
     state, record = with_line(1, 0.3)
     frequency, rms, p = spectral_lines(state.residual, record.time)[0]

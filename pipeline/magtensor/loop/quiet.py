@@ -9,7 +9,7 @@ from magtensor.calibration.types import Array
 
 LEAST_SAMPLES = 16
 BANDS = 20  # the quietest of so many parts of the spectrum bounds the white noise from above
-
+LEAST_IN_A_BAND = 20  # or the quietest is quiet by chance
 MOST_NOISE = 0.1  # of a series' variance: one that is rougher is no slow signal with some noise
 
 
@@ -33,7 +33,8 @@ def quieted(values: Array, clearance: float = 1.0) -> Array:
     trend = np.polynomial.Polynomial.fit(np.arange(n), values, 1)(np.arange(n))
     coefficients = dct(values - trend, norm="ortho")
     power = coefficients**2
-    lowest = min(float(band.mean()) for band in np.array_split(power, BANDS))
+    bands = int(np.clip(n // LEAST_IN_A_BAND, 1, BANDS))
+    lowest = min(float(band.mean()) for band in np.array_split(power, bands))
     second = np.diff(values, n=2)
     noise = min(float(np.median(np.abs(second)) * MAD_TO_SIGMA) ** 2 / 6.0, lowest)
     if noise <= 0 or (clearance <= 1.0 and noise > MOST_NOISE * float(power.mean())):

@@ -36,7 +36,7 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
     line = strongest_line(state, record)
     turning = predictable_from_direction(state)
     last = found.steps[-1].candidates if found.steps else ()
-    seen = [c for c in last if c.adjusted_p < c.alpha and c.assessment.null_p * c.tried < ALPHA]
+    seen = [c for c in last if c.adjusted_p < c.alpha and c.adjusted_null_p < ALPHA]
     suspects = [c for c in seen if not c.of_the_log]
     words: list[str] = []
     if found.shared is not None and found.shared.significant:
