@@ -48,7 +48,7 @@ def test_gradient_of_the_cost() -> None:
     data = sums.InPlane(y, centre, field)
     known = unit + 0.02 * rng.standard_normal(unit.shape)
     known /= np.linalg.norm(known, axis=1, keepdims=True)
-    data = replace(data, sighting=sighting(matrix, data.fields(matrix, centres), field, known, 0.02, 0.0))
+    data = replace(data, sighting=sighting(matrix, data.fields(matrix, centres), known, 0.02, 0.0))
 
     def cost(step: np.ndarray) -> float:
         moved = (np.eye(3) + step[:9].reshape(3, 3)) @ matrix
@@ -83,6 +83,30 @@ def test_the_common_rotation_is_determined() -> None:
     one = np.radians(0.5) / np.sqrt(2 * 600 / 3)
     assert np.sqrt(np.mean(np.square(angles))) < 2.5 * one
     assert calibrated_surveys(fit_surveys(surveys(0, case).samples)).common.frame.startswith("platform")
+
+
+def test_a_poor_total_field_does_not_outweigh_the_attitude() -> None:
+    """The size of a world field in place of a measurement: 100 nT off from sample to sample, and nobody says so."""
+    worst, squares = [], []
+    for seed in range(30):
+        truth = surveys(seed, Case(samples=(500,), attitude_deg=0.02, tilt_deg=15.0))
+        rough = truth.samples.total_field + 100.0 * np.random.default_rng(seed).standard_normal(500)
+        found = calibrated_surveys(fit_surveys(replace(truth.samples, total_field=rough), worst_error=1.0)).common
+        error = (found.matrix - np.linalg.inv(truth.forward)).ravel()
+        std = np.sqrt(np.diag(found.covariance).reshape(4, 12)[:, :9].ravel())
+        squares.append(np.mean((error / std) ** 2))
+        worst.append(np.abs(error).max())
+    assert np.mean(squares) == pytest.approx(1.0, abs=0.3)
+    # weighed as 1 nT, 100 nT of scatter in a cone of 15 deg would put some 100 / 500^1/2 / 15 deg^2 into the matrix
+    assert np.median(worst) < 5e-4
+
+
+def test_unknown_total_field_beside_an_attitude() -> None:
+    found = []
+    for seed in range(12):
+        truth = surveys(seed, Case(samples=(200, 200), levels=2, attitude_deg=0.3, tilt_deg=40.0))
+        found.append(errors(truth).standardised)
+    assert np.mean(np.square(found)) == pytest.approx(1.0, abs=0.4)
 
 
 def test_an_attitude_that_drifts_is_believed_less() -> None:

@@ -25,6 +25,7 @@ from .samples import Samples
 from .start import on_ellipsoid, on_known_field
 from .sums import Found, InPlane, minimised, with_scale
 
+BY_CHANCE = 0.01  # probability that noise as stated passes for more
 LEAST_SPREAD = 0.02  # of F: outputs that vary less saw one attitude
 LEAST_PER_SURVEY = 4  # samples: fewer cannot tell an offset
 _ROUNDS = 20
@@ -111,7 +112,7 @@ def fit_surveys(
             continue
         if not judge:
             break
-        again = _believed(fit, samples, reference_noise)
+        again = _believed(fit, samples)
         if np.array_equal(again, keep):
             break
         if again.sum() < 0.5 * count:
@@ -211,7 +212,7 @@ def _sighted(data: InPlane, direction: Array, known_std: float | None) -> tuple[
     std = _ROUGH if known_std is None else known_std
     for _ in range(_ROUNDS):
         b = data.fields(matrix, centres)
-        seen = sighting(matrix, b, data.total_field, direction, std, data.reference_noise)
+        seen = sighting(matrix, b, direction, std, None if data.level is not None else data.reference_noise)
         data = replace(data, sighting=seen)
         found = minimised(data, matrix, centres)
         moved = np.abs(found.matrix - matrix).max() / np.abs(matrix).max()
@@ -219,8 +220,11 @@ def _sighted(data: InPlane, direction: Array, known_std: float | None) -> tuple[
         before = std
         if known_std is None:
             std = attitude_std(seen, data.fields(matrix, centres), found.sums.total_field, 6)
-        if abs(std - before) <= _SETTLED * std and moved < 1e-6:
+        noise = _reference_noise(data, found) if data.level is None else data.reference_noise
+        rested = abs(std - before) <= _SETTLED * std and abs(noise - data.reference_noise) <= _SETTLED * noise
+        if rested and moved < 1e-6:
             break
+        data = replace(data, reference_noise=noise)
     assert data.sighting is not None
     wider = disagreement(data.sighting, data.fields(matrix, centres), found.sums.total_field)
     if wider > 1.0:
@@ -228,6 +232,18 @@ def _sighted(data: InPlane, direction: Array, known_std: float | None) -> tuple[
         data = replace(data, sighting=replace(data.sighting, root=root, coupling=coupling))
         found = minimised(data, matrix, centres)
     return data, found, std, wider
+
+
+def _reference_noise(data: InPlane, found: Found) -> float:
+    """nT: that of the total field where |b| - F scatters by more than it and the outputs do: beside directions it is
+    the ratio of both weights that counts. Unchanged where the excess may be chance."""
+    from scipy.special import chdtri
+
+    freedom = max(len(data.y) - 6 - 3 * data.centres, 1)
+    if found.sums.along <= float(chdtri(freedom, BY_CHANCE)):
+        return data.reference_noise
+    own = np.trace(found.matrix @ found.matrix.T) / 3.0 + data.reference_noise**2
+    return float(np.sqrt(data.reference_noise**2 + own * (found.sums.along / freedom - 1.0)))
 
 
 def _scaled(fit: SurveysFit, factor: float) -> SurveysFit:
@@ -241,7 +257,7 @@ def _told_apart(noise: Array, fit: SurveysFit, samples: Samples) -> Array:
     return told_apart(noise, (fit.forward, np.zeros((2, 3))), used.raw - offset, fit.found.sums.total_field)
 
 
-def _believed(fit: SurveysFit, samples: Samples, reference_noise: float) -> Mask:
+def _believed(fit: SurveysFit, samples: Samples) -> Mask:
     """(N,) samples whose squared residuals noise explains."""
     from scipy.special import chdtri
 
@@ -253,13 +269,13 @@ def _believed(fit: SurveysFit, samples: Samples, reference_noise: float) -> Mask
         known = np.zeros(samples.levels)
         known[samples.level[fit.keep]] = fit.found.sums.total_field
         total_field = np.where(known[samples.level] > 0, known[samples.level], np.nan)
-    seen = along(fit.found.matrix, np.zeros(3), y.T, total_field, reference_noise)
+    seen = along(fit.found.matrix, np.zeros(3), y.T, total_field, fit.data.reference_noise)
     squares = [(1, seen.residual**2)]
     if white.shape[1] > 3:
         squares.append((white.shape[1] - 3, np.sum((white - y @ fit.plane.basis.T) ** 2, axis=1)))
     if samples.direction is not None and fit.attitude_std is not None:
         b = (seen.unit * seen.length).T
-        view = sighting(fit.found.matrix, b, total_field, samples.direction, fit.attitude_std, reference_noise)
+        view = sighting(fit.found.matrix, b, samples.direction, fit.attitude_std, fit.data.reference_noise)
         side = across(view, slice(None), b, seen.length - total_field)
         squares.append((2, np.sum(side.residual**2, axis=1)))
     good = np.ones(len(y), dtype=bool)

@@ -69,7 +69,8 @@ def _worst_error(data: InPlane, found: Found, field: float) -> float:
     freedom = len(data.y) - len(sums.gradient) - max(data.level.max() if data.level is not None else 0, 0)
     if freedom < 1:
         return float("inf")
-    normal = sums.normal / max(sums.along / freedom, 1e-300)
+    # an attitude's standard deviation was found from what it leaves; that of the rest is in what the rest leaves
+    normal = sums.along_normal / max(sums.along / freedom, 1e-300) + sums.across_normal
     scale = np.sqrt(np.diag(normal))
     if not (np.isfinite(scale).all() and (scale > 0).all()):
         return float("inf")
