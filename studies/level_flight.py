@@ -9,7 +9,8 @@ reference is a base station, or one constant while the field varies. Logged are 
 platform leans and turns (and wanders by itself), the battery's voltage and a temperature.
 
 - **right**: the effect or a model declared indistinguishable from it is all that was adopted, on the sensor that has
-  it (a difference in delay: on either); **more**: something else was adopted beside it; **wrong**: only something else.
+  it (a difference in delay: on either); **shared**: so, but on another sensor too; **more**: something else was adopted
+  beside it; **wrong**: only something else was.
 - **told**: nothing was adopted, but the verdict says that something unexplained is left; **missed**: it does not.
 
 Rows that exist are not made again: the command goes on where it stopped, and writes the page from all of them.
@@ -173,14 +174,16 @@ def outcome(flight: Flight) -> dict[str, Any]:
         "seconds": round(time.monotonic() - began, 1),
     }
     right = [a for a in adopted if flight.effect in (a["error_model"], *a["indistinguishable_from"])]
+    own = f"S{min(2, flight.sensors)}"
     if flight.effect != "sampling_lag":
-        right = [a for a in right if a["sensors"] == [f"S{min(2, flight.sensors)}"]]
+        right = [a for a in right if own in a["sensors"]]
+    alone = flight.effect == "sampling_lag" or all(a["sensors"] == [own] for a in right)
     if adopted:
-        verdict = "wrong" if not right else "right" if len(adopted) == 1 else "more"
+        verdict = "wrong" if not right else "more" if len(adopted) > 1 else "right" if alone else "shared"
     else:
         verdict = "told" if told["present"] else "missed"
     if right and flight.effect == "current_field":
-        facts["coefficients"] = [[c["value"], c["std"]] for c in right[0]["coefficients"]]
+        facts["coefficients"] = [[c["sensor"], c["value"], c["std"]] for c in right[0]["coefficients"]]
         facts["truth"] = truth_of(flight)
     return {"verdict": verdict} | facts
 
@@ -246,19 +249,20 @@ def timely(stop: float, flight: Flight) -> dict[str, Any] | None:
     return outcome(flight) if time.monotonic() < stop else None
 
 
-VERDICTS = ("right", "more", "wrong", "told", "missed", "refused")
+VERDICTS = ("right", "shared", "more", "wrong", "told", "missed", "refused")
 
 
 def table(rows: list[dict[str, Any]]) -> str:
-    """How often each verdict came, by effect, strength and number of sensors."""
-    lines = ["| effect | x noise | sensors | surveys | " + " | ".join(VERDICTS) + " |", "|---|" + "---|" * 9]
-    flights = [Flight(*row["flight"]) for row in rows]
-    for effect, amplitude, sensors in sorted({(f.effect, f.amplitude, f.sensors) for f in flights}):
-        own = [r["verdict"] for f, r in zip(flights, rows, strict=True) if f[:3] == (effect, amplitude, sensors)]
+    """How often each verdict came, by whether the attitudes determined a calibration, effect and strength."""
+    lines = ["| attitudes | effect | x noise | surveys | " + " | ".join(VERDICTS) + " |", "|---|" + "---|" * 10]
+    kinds = [(bool(r.get("determined")), r["flight"][0], r["flight"][1]) for r in rows]
+    for kind in sorted(set(kinds)):
+        own = [r["verdict"] for k, r in zip(kinds, rows, strict=True) if k == kind]
         counts = [str(own.count(v)) for v in VERDICTS]
-        if not effect:  # nothing is there to be missed
-            counts = ["-", "-", *counts[2:4], "-", counts[5]]
-        lines.append(f"| {effect or 'none'} | {amplitude:g} | {sensors} | {len(own)} | {' | '.join(counts)} |")
+        if not kind[1]:  # nothing is there to be found or missed
+            counts = ["-", "-", "-", *counts[3:5], "-", counts[6]]
+        told = "enough" if kind[0] else "not enough"
+        lines.append(f"| {told} | {kind[1] or 'none'} | {kind[2]:g} | {len(own)} | {' | '.join(counts)} |")
     return "\n".join(lines)
 
 

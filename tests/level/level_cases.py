@@ -17,8 +17,9 @@ DIP = np.radians(66.0)
 
 @dataclass(frozen=True)
 class Flight:
-    """raw (N, S, 3) nT, field (N, 3) nT of the platform, forward (S, 3, 3), offset (S, 3) nT, current (N,) A."""
+    """total (N,), raw (N, S, 3), field (N, 3) of the platform, offset (S, 3), nT; forward (S, 3, 3); current (N,) A."""
 
+    total: Array
     raw: Array
     field: Array
     forward: Array
@@ -45,10 +46,12 @@ def flight(
     scale: float = 0.05,
     offset: float = 1500.0,
     effect: Array | None = None,
+    swing: float = 0.0,
 ) -> Flight:
     """Ten samples a second: the heading wanders round, roll and pitch by `tilt_deg` rms.
 
-    `effect` (3,) nT/A is what the current adds to the last sensor; it draws more when the platform leans.
+    `effect` (3,) nT/A is what the current adds to the last sensor; it draws more when the platform leans. The total
+    field swings by `swing` nT.
     """
     rng = np.random.default_rng(seed)
     yaw = np.cumsum(smooth(rng, count, 40.0)) * 0.03
@@ -58,6 +61,8 @@ def flight(
     level = np.stack([cy * world[0], -sy * world[0], np.full(count, world[2])], axis=1)
     x, z = cp * level[:, 0] - sp * level[:, 2], sp * level[:, 0] + cp * level[:, 2]
     field = np.stack([x, cr * level[:, 1] + sr * z, -sr * level[:, 1] + cr * z], axis=1)
+    total = TOTAL + swing * np.sin(np.arange(count) / 150.0)
+    field *= (total / TOTAL)[:, None]
     forward = np.eye(3) + scale * rng.standard_normal((sensors, 3, 3))
     at = offset * rng.standard_normal((sensors, 3))
     raw = np.einsum("sij,nj->nsi", forward, field) + at + noise * rng.standard_normal((count, sensors, 3))
@@ -65,19 +70,19 @@ def flight(
     current = 15.0 + 2.0 * lean + 0.1 * rng.standard_normal(count)
     if effect is not None:
         raw[:, -1] += (current - 15.0)[:, None] * effect
-    return Flight(raw, field, forward, at, current)
+    return Flight(total, raw, field, forward, at, current)
 
 
 def written(path: Path, flown: Flight) -> Path:
-    """The flight in the canonical layout, its total field one constant."""
+    """The flight in the canonical layout."""
     count, sensors, _ = flown.raw.shape
     since = "seconds since 2026-03-21T09:00:00Z"
     variables: dict[str, tuple[Any, str]] = {
         "time": (np.arange(count) / 10.0, since),
         "b_raw": (flown.raw, "nT"),
         "current_battery": (flown.current, "A"),
-        "reference/time": (np.array([-10.0, count / 10.0 + 10.0]), since),
-        "reference/total_field": (np.full(2, TOTAL), "nT"),
+        "reference/time": (np.arange(count) / 10.0, since),
+        "reference/total_field": (flown.total, "nT"),
     }
     with h5py.File(path, "w") as file:
         for name, (values, units) in variables.items():

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 from level_cases import flight, written
 
 from magtensor.cli import status_of
@@ -60,8 +59,12 @@ def test_it_can_be_refused_and_joint_says_where_to_go(tmp_path: Path, capsys: An
     assert "close_loop looks for effects all the same" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("seed", [14, 15])
-def test_one_sensor_alone(tmp_path: Path, seed: int) -> None:
-    """Its contrast with a constant total field is all there is; nothing is adopted on a clean flight."""
-    found = closed(tmp_path, written(tmp_path / "flight.h5", flight(seed, 1)))
-    assert found["adopted"] == []
+def test_one_sensor_alone_needs_a_measured_total_field(tmp_path: Path, capsys: Any) -> None:
+    found = closed(tmp_path, written(tmp_path / "measured.h5", flight(14, 1, tilt_deg=0.7, swing=20.0)))
+    assert found["adopted"] == [] and found["calibration"]["determined"] is False
+    constant = str(written(tmp_path / "constant.h5", flight(14, 1, tilt_deg=0.7)))
+    capsys.readouterr()
+    assert (
+        status_of(["run", str(RECIPES / "closed_loop.yaml"), "--input", constant, "--output", str(tmp_path / "b")]) == 3
+    )
+    assert "what the sensor adds cannot be told from the field" in capsys.readouterr().err
