@@ -1,6 +1,7 @@
 """What the loop finds, and whom it accuses, where the attitudes determine no calibration: level flight.
 
-    python studies/level_flight.py --rows build/level_flight.jsonl --page docs/level_flight.md --seconds 1200
+    python studies/level_flight.py --rows build/level.jsonl --first-seed 300 --repeats 1
+    python studies/level_flight.py --rows build/level.jsonl --first-seed 700 --repeats 0 --page docs/level_flight.md
 
 Each trial is a flight of five minutes at 10 Hz, simulated in the time domain: heading wanders freely, or eight legs to
 and fro; roll and pitch stay within 2 to 5 deg. Two or four sensors with 5 % of soft iron, 2 deg of misalignment,
@@ -12,6 +13,10 @@ platform leans and turns (and wanders by itself), the battery's voltage and a te
   it (a difference in delay: on either); **shared**: so, but on another sensor too; **more**: something else was adopted
   beside it; **wrong**: only something else was.
 - **told**: nothing was adopted, but the verdict says that something unexplained is left; **missed**: it does not.
+
+Within 2 to 5 deg the attitudes are sometimes just enough for the fit without a prior, which then decides as it does on
+any survey; those flights have rows of their own. Where the reference is a constant, the field's own variation is there
+to be told.
 
 Rows that exist are not made again: the command goes on where it stopped, and writes the page from all of them.
 """

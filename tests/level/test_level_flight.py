@@ -47,6 +47,11 @@ def test_a_clean_flight_is_not_accused(tmp_path: Path) -> None:
     assert found["calibration"]["determined"] is False
 
 
+def test_an_axis_that_stands_still_to_the_last_digit(tmp_path: Path) -> None:
+    found = closed(tmp_path, written(tmp_path / "still.h5", flight(16, noise=0.0, tilt_deg=1e-12)))
+    assert found["adopted"] == [] and found["calibration"]["determined"] is False
+
+
 def test_it_can_be_refused_and_joint_says_where_to_go(tmp_path: Path, capsys: Any) -> None:
     survey = written(tmp_path / "flight.h5", flight(13))
     recipe = str(RECIPES / "closed_loop.yaml")
