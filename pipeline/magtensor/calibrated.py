@@ -19,6 +19,7 @@ OFFSET_ENTRIES = tuple(f"offset_{j}" for j in AXES)
 SAME_PLACE_M = 1e-3  # positions nearer than this are the same place: a gradient changes by this share of its baseline
 
 B = ("time", "sensor", "axis")
+LEFT_FREE = "left free: "  # how the attribute `common_rotation` of a matrix begins where nothing fixed it
 
 
 def stored(calibration: ArrayCalibration, sensors: list[str], **facts: Any) -> dict[str, Variable]:
@@ -52,7 +53,10 @@ def left_open(survey: Survey) -> tuple[str, ...]:
     """What the calibration of a survey could not determine, in words."""
     if "calibration/matrix" not in survey:
         return ()
-    return tuple(json.loads(str(survey["calibration/matrix"].attrs.get("unobservable", "[]"))))
+    attributes = survey["calibration/matrix"].attrs
+    rotation = str(attributes.get("common_rotation", ""))
+    reason = (f"the common rotation: {rotation.removeprefix(LEFT_FREE)}",) if rotation.startswith(LEFT_FREE) else ()
+    return (*json.loads(str(attributes.get("unobservable", "[]"))), *reason)
 
 
 def restored(survey: Survey) -> ArrayCalibration:
@@ -73,17 +77,21 @@ def restored(survey: Survey) -> ArrayCalibration:
         offset,
         np.asarray(survey.values("calibration/covariance"), dtype=float),
         str(matrix.attrs["frame"]),
-        left_open(survey),
+        tuple(json.loads(str(matrix.attrs.get("unobservable", "[]")))),
         json.loads(matrix.attrs["diagnostics"]),
     )
 
 
-def corrected(calibration: ArrayCalibration, survey: Survey) -> dict[str, Variable]:
-    """`calibrated/b` of every sample and, where the total field is known, `residual/total_field`, after and before."""
+def corrected(calibration: ArrayCalibration, survey: Survey, not_taken_off: str = "") -> dict[str, Variable]:
+    """`calibrated/b` of every sample and, where the total field is known, `residual/total_field`, after and before.
+
+    `not_taken_off` names effects of the calibration that are still in it.
+    """
     raw = np.asarray(survey.values("b_raw"), dtype=float)
     b = calibration.apply(raw)
+    attributes = {"units": "nT", "frame": calibration.frame, "long_name": "calibrated field"}
     given: dict[str, Variable] = {
-        "calibrated/b": (B, b, {"units": "nT", "frame": calibration.frame, "long_name": "calibrated field"})
+        "calibrated/b": (B, b, attributes | ({"not_taken_off": not_taken_off} if not_taken_off else {}))
     }
     if "total_field" in survey:
         reference = survey.values("total_field")[:, None]

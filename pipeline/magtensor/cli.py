@@ -75,7 +75,14 @@ def run(
 @click.argument("calibration", type=FILE)
 @click.argument("survey", type=FILE)
 @click.option("--output", type=FILE, help="Default: the survey's name with .calibrated.nc.")
-@memory_option
+@click.option(
+    "--memory",
+    "memory_GiB",
+    type=click.FloatRange(min=0, min_open=True),
+    metavar="GIB",
+    help="Work through a survey longer than this in windows. Refused with --refine-rotation and --save-calibration, "
+    "and for a calibration that holds effects: they need the whole survey at once.",
+)
 @click.option(
     "--refine-rotation", is_flag=True,
     help="Turn the common frame until the tensor of this survey is symmetric, if its gradients tell that well enough.",
@@ -99,6 +106,8 @@ def apply(
     click.echo(f"calibrated: {applied.file}")
     if applied.refined:
         click.echo(f"common rotation: {applied.refined}.")
+    for note in applied.notes:
+        click.echo(note)
     click.echo(applied.sentence)
 
 

@@ -123,7 +123,7 @@ def run_long(
             done = 0
             for k, rows in enumerate(where, 1):
                 say(f"writing window {k} of {len(where)}")
-                found = apply_to(survey, survey_file, planned, rows=rows)
+                found = apply_to(survey, survey_file, planned, rows=rows, judge=False)  # the fit has judged them
                 found = found.merged(contrasts(found.values("calibrated/b")) if len(found.sensors) > 1 else {})
                 bad = doubted[done : done + len(found.time)]
                 done += len(found.time)

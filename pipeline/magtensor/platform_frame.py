@@ -217,7 +217,8 @@ def _read(
     if "position" not in survey:
         raise NotEnoughData("the symmetry of the tensor needs the sensors' positions", where="position")
     if declared.segments is not None:
-        use &= np.isin(_segments(survey, list(declared.segments)), list(declared.segments))
+        wanted = list(declared.segments)
+        use &= np.isin(_segments(survey, wanted, "segments are named for the symmetry"), wanted)
     noise = _noise(survey, b, use)
     return [symmetry(b[use], np.asarray(survey.values("position"), dtype=float), noise, errors)]
 
@@ -234,14 +235,19 @@ def _noise(survey: Survey, b: Array, use: NDArray[np.bool_]) -> Array:
 def _turning(
     axis: str, parts: list[int], survey: Survey, b: Array, use: NDArray[np.bool_], errors: CalibrationErrors
 ) -> Source:
-    number = _segments(survey, parts) if parts or "segment" in survey else np.zeros(len(b), dtype=int)
+    what = f"turns about {axis} are declared in segment {', '.join(map(str, parts))}"
+    number = _segments(survey, parts, what) if parts or "segment" in survey else np.zeros(len(b), dtype=int)
     among = use & np.isin(number, parts) if parts else use
     return turning(b[among], number[among], np.eye(3)[AXES.index(axis)], errors, f"turns about {axis}")
 
 
-def _segments(survey: Survey, wanted: list[int]) -> NDArray[np.int_]:
+def _segments(survey: Survey, wanted: list[int], what: str) -> NDArray[np.int_]:
     if "segment" not in survey:
-        raise DataError("segments are named, but the survey has no segment")
+        raise DataError(
+            f"{what}, but the survey has no segment",
+            where=str(survey.attributes.get("source", "")),
+            hint="`segment` (time) numbers the postures, lines or manoeuvres",
+        )
     number = np.asarray(survey.values("segment"), dtype=int)
     missing = [s for s in wanted if s not in number]
     if missing:

@@ -156,7 +156,7 @@ class Registry:
         known = self.names(kind, step)
         of = f" of {step}" if step else ""
         near = did_you_mean(name, known) or f"; there are {', '.join(known) or 'none'}"
-        return f"no {kind}{of} is called {name!r}{near}{self.broken_in_words()}"
+        return f"no {kind.replace('_', ' ')}{of} is called {name!r}{near}{self.broken_in_words()}"
 
     def broken_in_words(self) -> str:
         """For a message about something that is missing: a line for each plugin that could not be loaded."""

@@ -18,6 +18,7 @@ from magtensor.qc import told
 from magtensor.recipe.plan import Plan, PlannedStage, plan, read_plan
 from magtensor.recipe.source import Document
 from magtensor.runner import StageRecord, run
+from magtensor.survey.flags import summary
 from magtensor.survey.in_memory import Held
 from magtensor.survey.model import Survey, Variable
 from magtensor.survey.source import Source
@@ -151,6 +152,8 @@ class Computed:
         """Write the files of the contract."""
         made_by = result.write(output, self.survey, self.provenance(), self.outcome)
         notes = (*(f"not determined: {words}" for words in left_open(self.survey)), *told(self.survey))
+        if left := (self.outcome["error"].get("verify") or {}).get("not_taken_off"):
+            notes = (*notes, f"NOT taken off the verification survey: {left}")
         return Finished(output, self.outcome, sentence(self.outcome), made_by, self.survey, notes)
 
 
@@ -200,11 +203,16 @@ def is_hdf5(path: Path) -> bool:
 
 def verification(calibrated: Survey, path: Path | Held, planned: Plan) -> dict[str, Any]:
     """The error blocks of another survey: with the declared model alone, and with all that was adopted."""
-    after = survey_block(apply_to(calibrated, path, planned))
+    corrected = apply_to(calibrated, path, planned, uniform=True)
+    after = survey_block(corrected)
     before = after
     if "declared/matrix" in calibrated and "calibration/effects" in calibrated:
-        before = survey_block(apply_to(with_declared_alone(calibrated), path, planned))
-    return {"before": before, "after": after}
+        alone = apply_to(with_declared_alone(calibrated), path, planned, judge=False)
+        before = survey_block(alone.merged({"good": corrected["good"]}))  # the same samples
+    found: dict[str, Any] = {"before": before, "after": after}
+    if left := corrected["calibrated/b"].attrs.get("not_taken_off"):
+        found["not_taken_off"] = left
+    return found
 
 
 def with_declared_alone(calibrated: Survey) -> Survey:
@@ -220,10 +228,20 @@ def with_declared_alone(calibrated: Survey) -> Survey:
 
 
 def apply_to(
-    calibration: Survey, path: Path | Held, planned: Plan, *, tolerant: bool = False, rows: slice | None = None
+    calibration: Survey,
+    path: Path | Held,
+    planned: Plan,
+    *,
+    tolerant: bool = False,
+    rows: slice | None = None,
+    uniform: bool = False,
+    judge: bool = True,
 ) -> Survey:
-    """Another survey, loaded as the recipe loads and corrected with a calibration; the options as in `load_as`."""
-    return apply_and_refine(calibration, path, planned, tolerant=tolerant, rows=rows, refine_rotation=False)[0]
+    """Another survey, loaded as the recipe loads and corrected with a calibration; the options as in
+    `apply_and_refine`."""
+    return apply_and_refine(
+        calibration, path, planned, tolerant=tolerant, rows=rows, refine_rotation=False, uniform=uniform, judge=judge
+    )[0]
 
 
 def apply_and_refine(
@@ -234,8 +252,17 @@ def apply_and_refine(
     tolerant: bool,
     refine_rotation: bool,
     rows: slice | None = None,
+    uniform: bool = False,
+    judge: bool = True,
 ) -> tuple[Survey, Tied | None]:
-    """As `apply_to`; with `refine_rotation` turned into the frame in which the survey's own tensor is symmetric.
+    """Another survey, loaded as the recipe loads and corrected with a calibration.
+
+    Args:
+        tolerant, rows: as in `load_as`.
+        refine_rotation: turn it into the frame in which its own tensor is symmetric.
+        uniform: its field is known to be uniform.
+        judge: flag the samples that stand out alone (`standing_out`); the attribute `not_taken_off` of `calibrated/b`
+            names effects that cannot be taken off this survey.
 
     Returns:
         The survey, and the calibration in its new frame: None where no turn was asked for or is significant. The
@@ -243,8 +270,9 @@ def apply_and_refine(
     """
     from magtensor.calibrated import corrected, require_positions, require_sensors, restored
     from magtensor.effect_errors import taken_off
-    from magtensor.loop.stored import cleaned, stored_effects
+    from magtensor.loop.stored import cleaned, left_in, stored_effects
     from magtensor.platform_frame import as_fitted, with_refined_rotation
+    from magtensor.standing_out import flagged
     from magtensor.tensor.elements import five
     from magtensor.tensors import assembled, refined, refinement_noise, stored_assembly, stored_refinement
 
@@ -258,7 +286,10 @@ def apply_and_refine(
         fitted = restored(calibration)
         adopted, theta, means = stored_effects(calibration, planned.registry)
         before, survey = survey, cleaned(survey, as_fitted(calibration, fitted), adopted, theta, means)
-        survey = survey.merged(_named(corrected(fitted, survey), calibration))
+        if judge:
+            known = calibration.values("calibration/noise_std") if "calibration/noise_std" in calibration else None
+            survey = flagged(survey, fitted, known, uniform=uniform)
+        survey = survey.merged(_named(corrected(fitted, survey, left_in(survey, adopted)), calibration))
         if refine_rotation:
             survey, turned = with_refined_rotation(survey, calibration, fitted)
             fitted = turned.calibration if turned is not None else fitted
@@ -338,11 +369,13 @@ class Applied:
     """A calibrated survey that was written: its file, and in words how well the calibration fits it.
 
     `refined` says what the survey's gradients made of the calibration's frame; empty where that was not asked for.
+    `notes`: which samples were taken out of use, and which effects could not be taken off.
     """
 
     file: Path
     sentence: str
     refined: str = ""
+    notes: tuple[str, ...] = ()
 
 
 def apply(
@@ -396,7 +429,9 @@ def apply(
     words = str(found["calibrated/b"].attrs["rotation_refined"]) if refine_rotation else ""
     offsets = found["calibrated/b"].attrs.get("offset_of") if "calibrated/b" in found else None
     told = f" Offsets: {offsets}." if offsets else ""
-    return Applied(target, fit_in_words(survey_block(found)) + told, words)
+    left = str(found["calibrated/b"].attrs.get("not_taken_off", "")) if "calibrated/b" in found else ""
+    notes = (*summary(found.flags), *([f"NOT taken off: {left}"] if left else []))
+    return Applied(target, fit_in_words(survey_block(found)) + told, words, notes)
 
 
 def fit_in_words(block: dict[str, Any] | None) -> str:

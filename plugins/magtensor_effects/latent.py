@@ -26,7 +26,8 @@ def latent_source(
 
     The waveform is not a setting: the search finds it in what the sensors share beyond the field, and a correction
     finds each survey's own in the same way, where neither a uniform field nor a gradient could make it. It has unit
-    rms in the calibration's survey; one coefficient an axis, what the axis senses then. The part of the vectors that
+    rms in the calibration's survey; one coefficient an axis, what the axis senses then: C times the field at the
+    sensor, where a simulated source is given by that field. The part of the vectors that
     is common to all sensors follows from the total field alone. Tried only when no other model explains what is
     left, and never adopted with fewer than three sensors, where it may be a disturbance of one of them. Rivals:
     everything that nobody logged.

@@ -33,8 +33,8 @@ def current_field(
 ) -> Terms:
     """The magnetic field of a logged current: a constant vector at each sensor, in proportion to it.
 
-    One coefficient an axis: the field as the axis senses it. Rivals: other currents that switch together;
-    `supply_offset`, for the supply sags under the current.
+    One coefficient an axis: the field as the axis senses it, C times the field at the sensor (by which a simulated one
+    is given). Rivals: other currents that switch together; `supply_offset`, for the supply sags under the current.
     """
     name = CURRENT.pick(x, channel)
     return x.offsets(x.lagged(x.channel(name), lag_s), f"nT/{x.units[name]}")

@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import Field
 
 from magtensor import DataError, UsageError, stage
-from magtensor.calibrated import restored
+from magtensor.calibrated import LEFT_FREE, restored
 from magtensor.errors import did_you_mean
 from magtensor_stages.sensors import COMMON, naming, published_parameters
 
@@ -84,6 +84,17 @@ def fix_rotation(
         by_attitude = "attitude" in survey and not tied(calibration)  # or else it has been used already
         there = {"attitude": by_attitude, "sensor": sensor is not None, "axis": bool(turns)}
         sources = [name for name, known in there.items() if known] or ["symmetry"]
+    for option, given, name in (("sensor", sensor is not None, "sensor"), ("turns", bool(turns), "axis")):
+        if given and name not in sources:
+            raise UsageError(
+                f"fix_rotation: {option} is declared, but source {', '.join(sources)} leaves it out; name {name} in "
+                f"`source` too (a list), or leave {option} away"
+            )
+    if segments is not None and "symmetry" not in sources:
+        raise UsageError(
+            f"fix_rotation: segments are for the symmetry of the tensor, and source {', '.join(sources)} leaves it "
+            "out; name symmetry in `source` too (a list), or leave segments away"
+        )
     try:
         with naming(survey):
             done = tie(survey, calibration, sources, declared, float(np.radians(worst_deg)))
@@ -92,6 +103,6 @@ def fix_rotation(
             hint = "; ".join(p for p in (error.hint, "`fix_rotation: {required: false}` leaves it free") if p)
             raise type(error)(error.what, where=error.where, hint=hint) from error
         matrix = survey["calibration/matrix"]
-        attributes = dict(matrix.attrs) | {"common_rotation": f"left free: {error.what}"}
+        attributes = dict(matrix.attrs) | {"common_rotation": f"{LEFT_FREE}{error.what}"}
         return {"calibration/matrix": (matrix.dims, matrix.values, attributes)}
     return as_platform(survey, done) | published_parameters(done.calibration, survey.sensors)

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import os
 import resource
 import statistics
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
+from magtensor import __version__
 from magtensor.cli import cli, status_of
 
 COMMANDS = sorted(cli.commands)
@@ -89,6 +92,27 @@ def test_statuses_through_a_process(bench):
     wrong = magtensor("run", bench.recipe("  - strat\n"))
     assert wrong.returncode == 2
     assert wrong.stderr.startswith("error: ") and "did you mean start?" in wrong.stderr
+
+
+def test_apply_says_what_memory_is_refused_with(capsys):
+    status_of(["apply", "--help"])
+    said = "".join(capsys.readouterr().out.split())  # lines break at hyphens
+    expected = "Refused with --refine-rotation and --save-calibration, and for a calibration that holds effects"
+    assert expected.replace(" ", "") in said
+
+
+def test_a_clone_of_the_same_name_does_not_stand_for_the_package(tmp_path):
+    root = Path(__file__).parents[2]
+    (tmp_path / "magtensor").symlink_to(root)
+    code = "import magtensor; print(magtensor.__version__, magtensor.close_loop.__module__)"
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True)
+    assert done.stdout.split() == [__version__, "magtensor.closed_loop"], done.stderr
+    environment = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
+    code = f"import sys; sys.path = [p for p in sys.path if 'magtensor' not in p]; {code}"
+    bare = subprocess.run(
+        [sys.executable, "-S", "-c", code], cwd=tmp_path, env=environment, capture_output=True, text=True
+    )
+    assert "is a clone of magtensor, which is not installed here" in bare.stderr
 
 
 def test_a_reader_that_closes_early_is_no_error():

@@ -177,7 +177,8 @@ def test_effects_are_taken_off_in_the_frame_they_were_fitted_in(files):
         ("source=axis", DataError, "no turns are declared"),
         ("sensor=S9", DataError, "no sensor is called S9"),
         ("source=symmetry", NotEnoughData, "too small or too few"),
-        ("turns={z: [7]}", DataError, "segment"),
+        ("turns={z: [7]}", DataError, r"turns about z are declared in segment 7, but the survey has no segment"),
+        ("segments=[3]", DataError, "segments are named for the symmetry, but the survey has no segment"),
     ],
 )
 def test_mistakes_and_lacks_are_told(files, options, kind, said):
@@ -186,6 +187,33 @@ def test_mistakes_and_lacks_are_told(files, options, kind, said):
     overrides = ["stages.fix_rotation.required=true", f"stages.fix_rotation.{options}"]
     with pytest.raises(kind, match=said):
         run_recipe(RECIPE, files / "refused", survey=files / "plain.h5", overrides=overrides)
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"source": "attitude", "turns": {"z": []}}, "turns is declared, but source attitude leaves it out; name axis"),
+        ({"source": ["axis"], "turns": {"z": []}, "sensor": "S1"}, "sensor is declared, but source axis"),
+        ({"source": "attitude", "segments": [1]}, "segments are for the symmetry"),
+    ],
+)
+def test_what_is_declared_is_not_left_out(files, given, said):
+    from magtensor.session import run_recipe
+
+    overrides = ["stages.fix_rotation.required=false", *(f"stages.fix_rotation.{k}={v}" for k, v in given.items())]
+    with pytest.raises(UsageError, match=said):
+        run_recipe(RECIPE, files / "refused", survey=files / "attitude.h5", overrides=overrides)
+
+
+def test_why_declared_turns_could_not_be_used_is_printed(files):
+    from magtensor.session import run_recipe
+
+    overrides = ["stages.fix_rotation.required=false", "stages.fix_rotation.turns={z: [7]}"]
+    done = run_recipe(RECIPE, files / "turns", survey=files / "plain.h5", overrides=overrides)
+    words = (
+        "not determined: the common rotation: turns about z are declared in segment 7, but the survey has no segment"
+    )
+    assert words in done.notes
 
 
 def test_the_closed_loop_uses_an_attitude(files):

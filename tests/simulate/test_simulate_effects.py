@@ -412,6 +412,13 @@ def test_unlogged_channels_act_but_are_not_written() -> None:
         ({"type": "position_error", "rms_nT": 1.0}, {}, "adds nothing"),
         ({"type": "warm_up", "nT": [[1.0, 1.0, 1.0]] * 3}, {}, "3 vectors; the array has 4 sensors"),
         (
+            {"type": "sampling_lag", "lag_s": [1e-3, 0.0, 0.0, 0.0]},
+            {},
+            r"effects\[0\].lag_s: needs three numbers \(x, y, z\)",
+        ),
+        ({"type": "sampling_lag", "lag_s": [[1e-3], [0.0], [0.0], [0.0]]}, {}, "one for each sensor"),
+        ({"type": "sampling_lag", "lag_s": 1e-3}, {}, "written three times"),
+        (
             {"type": "reference_clock", "offset_s": 1e6},
             {"base_station": {"rate_Hz": 1.0}},
             "a clock error of 1e",

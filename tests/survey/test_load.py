@@ -187,7 +187,7 @@ def test_a_stated_end_of_range(load_variables: Load, variables: Variables) -> No
 
 @pytest.mark.parametrize(
     ("factor", "suspect"),
-    [(1e-3, "uT"), (1e-2, "mG"), (1e-5, "G"), (1e-9, "T"), (1e3, "pT labelled nT, or uT converted twice")],
+    [(1e-3, "uT"), (1e-2, "mG"), (1e-5, "G"), (1e-9, "T"), (1e3, "nT labelled uT, or pT labelled nT")],
 )
 def test_magnitudes_betray_wrong_units(load_variables: Load, variables: Variables, factor: float, suspect: str) -> None:
     wrong = changed(variables, "b_raw", lambda b: b * factor)

@@ -357,9 +357,10 @@ class Inquiry:
         if not found:
             reason = failed.get(component.name, "it has no regressor here that the calibration does not have already")
             raise DataError(f"{component.name} cannot be fitted to this survey: {reason}")
-        p = min(1.0, found[0].adjusted_p * max(len(self.open_models()), 1))
+        models = max(len(self.open_models()), 1)
+        p, null_p = (min(1.0, each * models) for each in (found[0].adjusted_p, found[0].adjusted_null_p))
         model = replace(found[0].model, settings={**given, **found[0].model.settings})
-        return replace(found[0], model=model, adjusted_p=p)
+        return replace(found[0], model=model, adjusted_p=p, adjusted_null_p=null_p)
 
     def _words_of(self, component: Component) -> str:
         if lacks := self.lacks(component):

@@ -10,9 +10,13 @@ import numpy as np
 
 from magtensor.calibration.types import Array, ArrayCalibration
 from magtensor.errors import DataError, UsageError
-from magtensor.loop.correction import corrected_raw, corrected_reference
-from magtensor.loop.model import Adopted
+from magtensor.loop.correction import TONE, corrected_raw, corrected_reference
+from magtensor.loop.model import Adopted, Record
+from magtensor.loop.needs import FACTS
 from magtensor.loop.record import record_of
+from magtensor.loop.screening import profiled
+from magtensor.loop.settings import AnyChannel
+from magtensor.loop.waveform import NAME
 from magtensor.registry import Registry
 from magtensor.survey.model import Survey, Variable
 
@@ -77,16 +81,60 @@ def cleaned(
     if not adopted:
         return survey
     record = record_of(survey, means=means, every=True)
+    where = str(survey.attributes.get("source", ""))
+    for effect in adopted:
+        if effect.component.effect != "site" and (lacking := _lacking(effect, record)):
+            raise DataError(
+                f"the effect {effect.name} of the calibration cannot be taken off: this survey has no {lacking}",
+                where=where,
+                hint=f"it logs {', '.join(sorted(record.logged)) or 'no channel'}; "
+                "apply a calibration without this effect, or log what it follows",
+            )
     try:
         raw = corrected_raw(record, calibration, adopted, theta, survey.good)
         field = corrected_reference(record, adopted, theta)
     except (KeyError, ValueError) as error:
+        names = ", ".join(a.name for a in adopted)
         raise DataError(
-            f"an effect of the calibration cannot be corrected on this survey: {error}",
-            where=str(survey.attributes.get("source", "")),
-            hint="the calibration follows a channel that this survey must log too",
+            f"the effects of the calibration ({names}) cannot be taken off this survey: {error}", where=where
         ) from error
     changed: dict[str, Variable] = {"b_raw": (("time", "sensor", "axis"), raw, dict(survey["b_raw"].attrs))}
     if field is not None:
         changed["total_field"] = (("time",), field, dict(survey["total_field"].attrs))
     return survey.merged(changed)
+
+
+def _lacking(effect: Adopted, record: Record) -> str:
+    """The channel that an effect follows and a survey does not log; "" where it logs all."""
+    x = record.excitation(record.raw, record.raw)
+    for name, mark in profiled(effect.component).items():
+        if isinstance(mark, AnyChannel):
+            channel = str(effect.settings.get(name, ""))
+            if channel and channel not in record.logged:
+                return f"channel {channel}"
+            if not channel and not mark.values(x):
+                return f"channel {mark.pattern}"
+    known = {"attitude": record.attitude is not None, "position": record.position is not None}
+    marked = {m.pattern for m in profiled(effect.component).values() if isinstance(m, AnyChannel)}
+    for need in effect.component.declared({}).needs:
+        options = [o for o in need.split("|") if o not in marked]
+        if options and not any(known.get(o, o in FACTS) or x.channels_like(o) for o in options):
+            return " or ".join(options)
+    return ""
+
+
+def left_in(survey: Survey, adopted: Sequence[Adopted]) -> str:
+    """Which effects of a calibration a survey does not let be taken off, and why; "" where there are none."""
+    words = []
+    names = {a.name for a in adopted}
+    if NAME in names:
+        why = ""
+        if "position" not in survey or not np.isfinite(survey.values("position")).all():
+            why = "the sensors' positions are not known"
+        elif len(survey.sensors) < 3:
+            why = "with fewer than three sensors it cannot be told from a gradient"
+        if why:
+            words.append(f"{NAME}: {why}")
+    if TONE in names and len(survey.sensors) < 2:
+        words.append(f"{TONE}: its phase on this survey is not known from a single sensor")
+    return "; ".join(words)

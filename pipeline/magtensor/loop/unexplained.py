@@ -8,20 +8,24 @@ yet does not predict held-out data.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from magtensor.loop.assessment import WHITE
+from magtensor.calibration.types import Mask
+from magtensor.loop.assessment import WHITE, assess
 from magtensor.loop.direction import direction_series
 from magtensor.loop.excitation import Excitation
 from magtensor.loop.latent import shared_words
-from magtensor.loop.model import Record, State
+from magtensor.loop.model import Record, State, without
+from magtensor.loop.residual import residual_of
 from magtensor.loop.screening import Candidate
 from magtensor.loop.search import Search
 from magtensor.loop.spectrum import spectral_lines
 from magtensor.loop.terms import Terms
 
+LONGEST_SPIKE = 2  # samples: what lasts longer is no accident of the recording
 ALPHA = 0.001  # of each of the tests
 NOISE = "what is left is noise: white, and slow noise of each sensor alone"
 LEAST_T = 4.5  # one in a thousand by chance: paired t over folds of what the direction predicts
@@ -37,6 +41,9 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
     turning = predictable_from_direction(state)
     last = found.steps[-1].candidates if found.steps else ()
     seen = [c for c in last if c.adjusted_p < c.alpha and c.adjusted_null_p < ALPHA]
+    flagged = lasting(~state.fit.keep)
+    if flagged.any():  # while effects were sought, what lasts was believed
+        seen = [c for c in seen if _still_significant(c, state)]
     suspects = [c for c in seen if not c.of_the_log]
     words: list[str] = []
     if found.shared is not None and found.shared.significant:
@@ -48,15 +55,53 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
     if suspects:
         names = ", ".join(c.model.name for c in suspects)
         words.append(f"significant but of no use on held-out blocks: {names}")
-    present = bool(words)
-    if present:
+    if words:
         words.insert(0, f"{excess:.3g} nT rms above the white noise, mostly on {_sensors(state)}")
+    if flagged.any():
+        words.append(flagged_words(flagged, state, record))
+    present = bool(words)
     return {
         "present": present,
         "excess_rms_nT": excess,
         "description": "; ".join(words) if present else NOISE,
         "looks_like": _looks_like(last) if present else [],
     }
+
+
+def lasting(bad: Mask) -> Mask:
+    """(N,) samples in runs of bad ones that are longer than a spike and its neighbour."""
+    out = np.zeros(len(bad), dtype=bool)
+    edges = np.flatnonzero(np.diff(np.concatenate(([0], bad.astype(int), [0]))))
+    for start, stop in zip(edges[0::2], edges[1::2], strict=True):
+        out[start:stop] = stop - start > LONGEST_SPIKE
+    return out
+
+
+def _still_significant(candidate: Candidate, state: State) -> bool:
+    """Whether a model is asked for by the samples that are still in use."""
+    terms = candidate.model.terms(state.excitation).at(state.residual.samples)
+    now = assess(state.residual, terms, state.colours, state.terms)
+    return now.p * candidate.tried < candidate.alpha and now.null_p * candidate.tried < ALPHA
+
+
+def flagged_words(flagged: Mask, state: State, record: Record) -> str:
+    """How many samples were taken out of use because nothing explains them, when, how large, on which sensors."""
+    raw, reference = without(record, [a.terms(state.excitation) for a in state.adopted], state.theta)
+    every = residual_of(replace(state.fit, keep=np.ones(len(flagged), dtype=bool)), raw, reference)
+    runs = int(np.sum(np.diff(np.concatenate(([0], flagged.astype(int)))) == 1))
+    after = record.time[flagged] - record.start
+    where, amount = "", 0.0
+    if every.across is not None:
+        each = (every.across[flagged] * every.noise).reshape(int(flagged.sum()), -1, 3)
+        size = np.sqrt(np.mean(each**2, axis=(0, 2)))
+        amount, where = float(size.max()), f", mostly on {state.excitation.sensors[int(np.argmax(size))]}"
+    elif every.along is not None:
+        amount = float(np.sqrt(np.mean(every.along[flagged] ** 2)) * every.scale)
+    stretches = f"{runs} stretch{'es' * (runs > 1)}"
+    return (
+        f"{int(flagged.sum())} samples in {stretches} ({after[0]:.4g} to {after[-1]:.4g} s after the start) fit no "
+        f"calibration, by {amount:.3g} nT rms{where}: they are flagged and have no part in the calibration"
+    )
 
 
 def predictable_from_direction(state: State) -> float:

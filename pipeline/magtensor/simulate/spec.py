@@ -8,7 +8,7 @@ from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 
 from magtensor.errors import UsageError
 
@@ -16,7 +16,25 @@ Array = NDArray[np.float64]
 
 Vector3 = Annotated[list[float], Field(min_length=3, max_length=3)]
 Matrix3 = Annotated[list[Vector3], Field(min_length=3, max_length=3)]
-PerSensor = Vector3 | list[Vector3]  # one vector for all sensors, or one per sensor
+
+
+def _vectors(value: object) -> object:
+    """One message for all that is no vector, nor a list of vectors."""
+
+    def numbers(row: object) -> bool:
+        return isinstance(row, list) and all(isinstance(v, (int, float)) and not isinstance(v, bool) for v in row)
+
+    if isinstance(value, list) and value:
+        rows = [value] if numbers(value) else value
+        if all(numbers(row) and len(row) == 3 for row in rows):
+            return value
+    raise ValueError(
+        "needs three numbers (x, y, z): one such list for all sensors, or a list of them with one for each sensor; "
+        "a value that a sensor's axes share is written three times"
+    )
+
+
+PerSensor = Annotated[Vector3 | list[Vector3], BeforeValidator(_vectors)]  # one for all sensors, or one per sensor
 
 
 def _in_utc(value: str) -> str:

@@ -23,7 +23,7 @@ LOOKED_AT = 200_000  # samples; a step shows in these as in ten million
 # What a number that was labelled nT may have been, with the factor that makes nT of it.
 RIVALS = (
     ("uT labelled nT", 1e3), ("mG labelled nT", 1e2), ("G labelled nT", 1e5), ("mT labelled nT", 1e6),
-    ("T labelled nT", 1e9), ("pT labelled nT, or uT converted twice", 1e-3), ("T converted twice", 1e-9),
+    ("T labelled nT", 1e9), ("nT labelled uT, or pT labelled nT", 1e-3), ("nT labelled T", 1e-9),
 )  # fmt: skip
 
 

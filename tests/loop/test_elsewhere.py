@@ -1,0 +1,197 @@
+"""A calibration on another survey: what it cannot take off, and samples that nothing explains, there and in the fit."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+from loop_cases import scenario, survey_file
+from numpy.typing import NDArray
+
+import magtensor
+from magtensor.cli import status_of
+from magtensor.closed_loop import ClosedLoop
+from magtensor.standing_out import REASON, standing_out
+
+MOTION = scenario()["motion"] | {"duration_s": 600.0}
+HEATER = {"type": "current_field", "rms_nT": 5.0, "channel": "current_heater"}
+VECTORS = [[0.9, -0.4, 0.6], [-0.5, 0.8, 0.1], [0.2, 0.5, -0.9], [0.7, -0.6, 0.3]]
+SLOW = {"type": "latent_source", "nT_per_unit": VECTORS, "waveform_of": {"type": "smooth", "rms": 2.0, "time_s": 60.0}}
+Change = Callable[[h5py.File], None]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    place = tmp_path_factory.mktemp("surveys")
+    for name, seed, effects in (("clean", 5, ()), ("other", 6, ()), ("heated", 5, (HEATER,)), ("hot", 6, (HEATER,))):
+        survey_file(place, scenario(seed, *effects, motion=MOTION), f"{name}.h5")
+    return place
+
+
+@pytest.fixture(scope="module")
+def plain(folder: Path) -> ClosedLoop:
+    return magtensor.close_loop(folder / "clean.h5", search=[])
+
+
+def changed(folder: Path, name: str, change: Change) -> Path:
+    path = folder / f"changed_{name}"
+    shutil.copy(folder / name, path)
+    with h5py.File(path, "r+") as file:
+        change(file)
+    return path
+
+
+def spikes(samples: list[int]) -> Change:
+    def change(file: h5py.File) -> None:
+        raw = file["b_raw"][()]
+        for k, i in enumerate(samples):
+            raw[i, k % 4, k % 3] += 40.0
+        file["b_raw"][...] = raw
+
+    return change
+
+
+def test_a_missing_channel_is_told_with_survey_and_effect(
+    tmp_path: Path, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    found = magtensor.close_loop(folder / "heated.h5", search=["current_field"])
+    found.calibration.save(tmp_path / "c.nc")
+    bare = changed(folder, "hot.h5", lambda f: f.pop("current_heater"))
+    assert status_of(["apply", str(tmp_path / "c.nc"), str(bare), "--output", str(tmp_path / "a.nc")]) == 3
+    said = capsys.readouterr().err
+    assert re.search(
+        r"changed_hot\.h5: the effect current_field of the calibration cannot be taken off: this survey has no channel "
+        r"current_heater\n  it logs temperature; ",
+        said,
+    )
+    assert not (tmp_path / "a.nc").exists()
+
+
+SPIKED = [40, 41, 200, 203, 205, 700, 1100]  # a pair, three near each other, three alone
+
+
+def test_spikes_of_another_survey_are_flagged(tmp_path: Path, folder: Path, plain: ClosedLoop) -> None:
+    calibrated = plain.calibration.apply(changed(folder, "other.h5", spikes(SPIKED)))
+    assert np.flatnonzero(~calibrated["calibrated/good"].values).tolist() == SPIKED
+    flags = json.loads(calibrated["qc"].attrs["flag_record"])
+    assert sum(f["samples"] for f in flags) == len(SPIKED)
+    assert {(f["by"], f["reason"]) for f in flags} == {("apply", REASON)}
+    clean = plain.calibration.apply(folder / "other.h5")
+    assert clean["calibrated/good"].all()
+    keep = calibrated["calibrated/good"]
+    np.testing.assert_array_equal(calibrated["calibrated/b"][keep.values], clean["calibrated/b"][keep.values])
+
+
+def test_spikes_do_not_spoil_the_verification(folder: Path) -> None:
+    blocks = [
+        magtensor.close_loop(folder / "heated.h5", search=["current_field"], verify=path).verdict["error"]["verify"]
+        for path in (folder / "hot.h5", changed(folder, "hot.h5", spikes(SPIKED)))
+    ]
+    for block in ("before", "after"):
+        clean, spiked = (b[block] for b in blocks)
+        assert spiked["samples"] == clean["samples"] - len(SPIKED)
+        for figure in ("total_field_rms_nT", "tensor_rms_nT_per_m"):
+            assert spiked[figure]["all"] == pytest.approx(clean[figure]["all"], rel=0.02)
+
+
+def test_a_command_says_what_it_flagged(
+    tmp_path: Path, folder: Path, plain: ClosedLoop, capsys: pytest.CaptureFixture[str]
+) -> None:
+    plain.calibration.save(tmp_path / "c.nc")
+    survey = changed(folder, "other.h5", spikes(SPIKED))
+    assert status_of(["apply", str(tmp_path / "c.nc"), str(survey), "--output", str(tmp_path / "a.nc")]) == 0
+    assert f"apply: 7 samples: {REASON}" in capsys.readouterr().out
+
+
+def test_near_a_source_nothing_is_flagged(folder: Path, plain: ClosedLoop) -> None:
+    """A dipole a few baselines away shows off field and gradient for seconds, and not for a sample."""
+    source = {"position_m": [1.5, 0.0, 0.5], "moment_Am2": [0.0, 30.0, 0.0]}
+    field = scenario()["field"] | {"dipoles": [source]}
+    near = survey_file(folder, scenario(6, motion=MOTION, field=field), "near.h5")
+    calibrated = plain.calibration.apply(near)
+    assert float(abs(calibrated["calibrated/tensor"]).max()) > 1000.0
+    assert calibrated["calibrated/good"].all()
+
+
+@pytest.mark.parametrize("samples", [60, 600, 6000])
+def test_clean_noise_rarely_stands_out(samples: int) -> None:
+    """One survey in a hundred: of 300, more than nine would be chance of one in a thousand."""
+    rng = np.random.default_rng(samples)
+    tries = 300 if samples < 6000 else 100
+
+    def alone(parts: list[NDArray[np.float64]]) -> bool:
+        return bool(standing_out(parts).any())
+
+    count = sum(alone([rng.standard_normal((samples, k)) for k in (4, 1)]) for _ in range(tries))
+    assert count <= 9
+
+
+def test_what_lasts_is_left_to_speak_for_itself() -> None:
+    rng = np.random.default_rng(1)
+    values = rng.standard_normal((600, 4))
+    values[100] += 30.0
+    values[200:202] += 30.0
+    values[300:310] += 30.0
+    values[400:] += 30.0
+    assert np.flatnonzero(standing_out([values])).tolist() == [100, 200, 201]
+
+
+def test_a_source_that_cannot_be_taken_off_is_told(
+    tmp_path: Path, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    longer = scenario()["motion"] | {"duration_s": 1200.0}
+    survey, other = (survey_file(folder, scenario(s, SLOW, motion=longer), f"slow{s}.h5") for s in (8, 9))
+    bare = changed(folder, other.name, lambda f: f.pop("position"))
+    found = magtensor.close_loop(survey, search=["latent_source"], verify=bare)
+    assert [a["error_model"] for a in found.verdict["adopted"]] == ["latent_source"]
+    words = "latent_source: the sensors' positions are not known"
+    assert found.verdict["error"]["verify"]["not_taken_off"] == words
+    finished = found.save(tmp_path / "out")
+    assert f"NOT taken off the verification survey: {words}" in finished.notes
+    calibration = str(tmp_path / "out" / "calibration.nc")
+    assert status_of(["apply", calibration, str(bare), "--output", str(tmp_path / "a.nc")]) == 0
+    assert f"NOT taken off: {words}" in capsys.readouterr().out
+    with h5py.File(tmp_path / "a.nc") as file:
+        assert file["calibrated/b"].attrs["not_taken_off"] == words
+    assert status_of(["apply", calibration, str(other), "--output", str(tmp_path / "a.nc")]) == 0
+    assert "NOT taken off" not in capsys.readouterr().out
+
+
+def saturated(span: slice, limit_nT: float) -> Change:
+    """An axis at the end of its range, noise on it, so that no number repeats itself."""
+
+    def change(file: h5py.File) -> None:
+        raw = file["b_raw"][()]
+        rng = np.random.default_rng(1)
+        own = raw[span, 1, 0]
+        raw[span, 1, 0] = np.minimum(own, limit_nT + 0.15 * rng.standard_normal(len(own)))
+        file["b_raw"][...] = raw
+
+    return change
+
+
+def test_a_saturated_stretch_is_told_as_what_it_is(folder: Path) -> None:
+    path = changed(folder, "clean.h5", saturated(slice(500, 580), 15_000.0))
+    with h5py.File(path) as file, h5py.File(folder / "clean.h5") as clean:
+        away = np.abs(file["b_raw"][:, 1, 0] - clean["b_raw"][:, 1, 0])
+    first, last = np.flatnonzero(away > 1000.0)[[0, -1]] / 2.0
+    found = magtensor.close_loop(path)
+    left: dict[str, Any] = found.verdict["unexplained"]
+    assert found.verdict["adopted"] == []
+    assert left["present"]
+    told = re.search(
+        r"(\d+) samples in \d+ stretch\w* \(([\d.]+) to ([\d.]+) s.*mostly on S2: they are flagged", left["description"]
+    )
+    assert told is not None
+    assert abs(float(told[2]) - first) <= 2.0 and abs(float(told[3]) - last) <= 2.0
+    assert int(told[1]) <= (~found.computed.survey.good).sum()
+    # what is left when they are out of use is noise, and nothing is said against it
+    assert "of no use" not in left["description"] and "above the white noise" not in left["description"]
+    assert found.verdict["error"]["held_out"]["after"]["total_field_rms_nT"]["all"] < 0.25
