@@ -1,0 +1,180 @@
+"""What the loop does about an effect that its catalogue lacks: each error model left out in turn.
+
+    python studies/leave_one_out.py --rows build/leave_one_out.jsonl --page docs/leave_one_out.md --seconds 900
+
+Each trial is a survey simulated in the time domain anew (as in `loop_power.py`: four sensors, 0.15 nT of white noise
+an axis and 1/f noise of 0.02 nT/rtHz at 1 Hz, half an hour of tumbling), with one effect of a given rms over the white
+noise. It goes through the whole search with every error model but that of the effect.
+
+- **told**: nothing is adopted, and the verdict says that something unexplained is left, and describes it.
+- **rival**: another model is adopted in its place. `held out` is |b| - F on blocks that no fit has seen, before and
+  after; it **predicts** if that falls, or if each adopted model lowers the residual on held-out blocks. `left` is the
+  rms of what remains in units of the white noise (about 1.1 with the 1/f noise alone). It **remains** if the verdict
+  says that something unexplained is left.
+- **silent**: nothing is adopted, and nothing is said.
+
+A rival may be the same model under another name: `channel_response` of the thermometer is `temperature_offset`.
+
+Rows that exist are not made again: the command goes on where it stopped, and writes the page from all of them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import time
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import numpy as np
+from loop_power import Trial, models, simulated
+from loop_surveys import EFFECTS, recorded
+
+from magtensor.errors import MagtensorError
+from magtensor.loop.errors_before_after import held_out_error
+from magtensor.loop.model import Fitting
+from magtensor.loop.outcome import removal
+from magtensor.loop.search import search
+from magtensor.loop.unexplained import unexplained
+
+FIRST_SEED = 5000
+NOISE = "white and 1/f"
+LEFT = 1.2  # times the white noise: more than the 1/f noise leaves
+HEAD = (
+    "left out", "rms / noise", "surveys", "told", "rival", "predicts", "remains", "silent", "held out, nT", "left",
+    "rivals; or what is said",
+)  # fmt: skip
+
+
+def tried(trial: Trial) -> dict[str, Any]:
+    """The row of one trial."""
+    row: dict[str, Any] = trial._asdict()
+    how = Fitting()
+    try:
+        record = recorded(simulated(trial))
+        found = search(record, [m for name, m in models().items() if name != trial.effect], how)
+    except MagtensorError as error:
+        return row | {"outcome": "cannot be", "description": str(error).splitlines()[0]}
+    last = found.last
+    left = unexplained(found, found.record)
+    return row | {
+        "outcome": "rival" if last.adopted else "told" if left["present"] else "silent",
+        "adopted": [a.name for a in last.adopted],
+        "present": left["present"],
+        "description": left["description"],
+        "looks_like": left["looks_like"],
+        "left": float(np.sqrt(last.residual.square())),
+        "before": _all(held_out_error(record, [], how, [], last.fit.keep)),
+        "after": _all(held_out_error(found.record, last.adopted, how, last.theta, last.fit.keep)),
+        "removal": [removal(last, i) for i in range(len(last.adopted))],
+    }
+
+
+def _all(block: dict[str, Any] | None) -> float | None:
+    value = ((block or {}).get("total_field_rms_nT") or {}).get("all")
+    return None if value is None else float(value)
+
+
+def predicts(row: dict[str, Any]) -> bool:
+    """Whether what was adopted lowers an error on blocks it has not seen."""
+    outright = row["before"] is not None and row["after"] is not None and row["after"] < row["before"]
+    return outright or all(after < before for before, after in row["removal"])
+
+
+def page(rows: Sequence[dict[str, Any]]) -> str:
+    """The printed table."""
+    about = (__doc__ or "").split("\n", 2)[2].strip()
+    lines = ["# Every error model left out in turn", "", about, "", f"{len(rows)} surveys so far.", ""]
+    lines += [f"| {' | '.join(HEAD)} |", "|---" * len(HEAD) + "|"]
+    for effect in EFFECTS:
+        for amplitude in sorted({r["amplitude"] for r in rows if r["effect"] == effect}):
+            lines.append(
+                _line(effect, amplitude, [r for r in rows if (r["effect"], r["amplitude"]) == (effect, amplitude)])
+            )
+    usable = [r for r in rows if r["outcome"] != "cannot be"]
+    rivals = [r for r in usable if r["outcome"] == "rival"]
+    quiet = [r for r in rivals if not r["present"] and r["left"] > LEFT]
+    lines += [
+        "",
+        f"Of {len(usable)} surveys {_count(usable, 'told')} were told as unexplained, in {len(rivals)} a rival was "
+        f"adopted, and {_count(usable, 'silent')} were passed over in silence. Of the rivals "
+        f"{sum(not predicts(r) for r in rivals)} did not predict held-out blocks; {len(quiet)} left more than {LEFT:g} "
+        "times the white noise without a word.",
+        "",
+    ]
+    return "\n".join(lines)
+
+
+def _line(effect: str, amplitude: float, own: Sequence[dict[str, Any]]) -> str:
+    usable = [r for r in own if r["outcome"] != "cannot be"]
+    rivals = [r for r in usable if r["outcome"] == "rival"]
+    told = [r for r in usable if r["outcome"] == "told"]
+    words = [", ".join(sorted({n for r in rivals for n in r["adopted"]})), *(r["description"] for r in told[:1])]
+    if len(usable) < len(own):
+        words.append(f"{len(own) - len(usable)} could not be calibrated")
+    cells = [
+        f"`{effect}`", f"{amplitude:g}", str(len(own)), str(len(told)), str(len(rivals)),
+        f"{sum(map(predicts, rivals))} of {len(rivals)}" if rivals else "",
+        f"{sum(r['present'] for r in rivals)} of {len(rivals)}" if rivals else "",
+        str(_count(usable, "silent")), f"{_median(usable, 'before')} -> {_median(usable, 'after')}",
+        _median(usable, "left"), "; ".join(w for w in words if w),
+    ]  # fmt: skip
+    return f"| {' | '.join(cells)} |"
+
+
+def _count(rows: Sequence[dict[str, Any]], outcome: str) -> int:
+    return sum(r["outcome"] == outcome for r in rows)
+
+
+def _median(rows: Sequence[dict[str, Any]], key: str) -> str:
+    values = [r[key] for r in rows if r.get(key) is not None]
+    return f"{np.median(values):.3g}" if values else "unknown"
+
+
+def in_time(trial: Trial, end: float) -> dict[str, Any] | None:
+    """The row of a trial; None when the time is over."""
+    return tried(trial) if time.time() < end else None
+
+
+def main() -> None:
+    """Run what is missing and write the page."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rows", type=Path, required=True, help="one line of JSON a trial, read first and added to")
+    parser.add_argument("--page", type=Path, help="write the table here")
+    parser.add_argument("--seeds", type=int, default=1, help="surveys of each effect and amplitude")
+    parser.add_argument("--effects", default=",".join(EFFECTS))
+    parser.add_argument("--amplitudes", default="3", help="rms of the effect in units of the white noise")
+    parser.add_argument("--rate", type=float, default=2.0, help="Hz")
+    parser.add_argument("--seconds", type=float, default=np.inf, help="no trial is begun later")
+    parser.add_argument("--workers", type=int, default=2)
+    chosen = parser.parse_args()
+    end = time.time() + chosen.seconds
+    chosen.rows.parent.mkdir(parents=True, exist_ok=True)
+    rows = [json.loads(line) for line in chosen.rows.open()] if chosen.rows.exists() else []
+    done = {tuple(row[key] for key in Trial._fields) for row in rows}
+    planned = [
+        Trial(effect, float(amplitude), "tumbling", NOISE, seed, chosen.rate)
+        for seed in range(FIRST_SEED, FIRST_SEED + chosen.seeds)
+        for amplitude in chosen.amplitudes.split(",")
+        for effect in chosen.effects.split(",")
+    ]
+    missing = [trial for trial in planned if tuple(trial) not in done]
+    with chosen.rows.open("a") as out, ProcessPoolExecutor(chosen.workers) as pool:
+        for row in pool.map(in_time, missing, [end] * len(missing)):
+            if row is None:
+                continue
+            rows.append(row)
+            out.write(json.dumps(row) + "\n")
+            out.flush()
+            print(row["effect"], row["outcome"], ", ".join(row.get("adopted", ())), row["description"])
+    if chosen.page:
+        chosen.page.write_text(page(rows))
+
+
+if __name__ == "__main__":
+    main()
