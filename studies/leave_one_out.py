@@ -88,8 +88,16 @@ def predicts(row: dict[str, Any]) -> bool:
 
 def page(rows: Sequence[dict[str, Any]]) -> str:
     """The printed table."""
+    rates = " and ".join(f"{r:g}" for r in sorted({row["rate_Hz"] for row in rows}))
     about = (__doc__ or "").split("\n", 2)[2].strip()
-    lines = ["# Every error model left out in turn", "", about, "", f"{len(rows)} surveys so far.", ""]
+    lines = [
+        "# Every error model left out in turn",
+        "",
+        about,
+        "",
+        f"{len(rows)} surveys so far, at {rates} Hz (`--rate`).",
+        "",
+    ]
     lines += [f"| {' | '.join(HEAD)} |", "|---" * len(HEAD) + "|"]
     for effect in EFFECTS:
         for amplitude in sorted({r["amplitude"] for r in rows if r["effect"] == effect}):

@@ -84,7 +84,7 @@ def test_the_result_says_who_did_what_and_can_be_made_again(tmp_path: Path, expl
     ]  # fmt: skip
     assert "traced to current_field; adopted by hand: offset_drift" in finished.sentence
     page = (tmp_path / "out" / "report.html").read_text()
-    assert "round by round" in page and page.count("adopted current_field") == 1
+    assert "round by round" in page and page.count("<li>adopted current_field") == 1
     assert "offset_drift (by hand)" in page and "<code>reject channel_response</code>" in page
     again = run_recipe(tmp_path / "out" / "result.nc", tmp_path / "again")
     assert again.notes[0] == "reproduced bit for bit"
