@@ -13,13 +13,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from magtensor.calibrated import MATRIX_ENTRIES, OFFSET_ENTRIES
 from magtensor.calibration.joint import calibrated, nearest_frame
 from magtensor.calibration.joint_covariance import frame_projection
 from magtensor.calibration.types import Array, ArrayCalibration
 from magtensor.loop.correction import TONE
 from magtensor.loop.model import Adopted, State
 from magtensor.loop.record import record_of
-from magtensor.loop.terms import joined
+from magtensor.loop.terms import REFERENCE, joined
+from magtensor.loop.waveform import NAME as HIDDEN
 from magtensor.platform_frame import as_fitted
 from magtensor.survey.model import Survey, Variable
 from magtensor.tensor.uncertainty import TakenOff
@@ -32,9 +34,10 @@ class WithCoefficients:
     """A calibration whose covariance holds what the coefficients leave open.
 
     Attributes:
+        calibration: with directions of the coefficients that no data show among what is unobservable.
         covariance: (12 S + P,) squared: its parameters, then the coefficients of all error models.
-        names: (P,) of the coefficients; values: (P,).
-        open: how many directions of the coefficients no data show (given is the solution of least norm).
+        names: (P,) of the coefficients; values: (P,), of least norm where directions are open.
+        open: how many directions these are.
     """
 
     calibration: ArrayCalibration
@@ -54,12 +57,16 @@ def with_coefficients(state: State) -> WithCoefficients:
     mixed = slope @ theta
     models = [a.name for a, t in zip(state.adopted, state.theta, strict=True) for _ in t]
     names = (":".join(p for p in parts if p) for parts in zip(models, terms.sensors, terms.names, strict=True))
+    free, open_ = calibration.unobservable, terms.count - estimate.rank
+    if open_:
+        words = f"{open_} of {terms.count} directions of the coefficients of {', '.join(dict.fromkeys(models))}"
+        free = (*free, f"{words}: no data show them, and they were left zero")
     return WithCoefficients(
-        replace(calibration, covariance=own),
+        replace(calibration, covariance=own, unobservable=free),
         np.block([[own, mixed], [mixed.T, theta]]),
         tuple(names),
         np.concatenate(state.theta),
-        terms.count - estimate.rank,
+        open_,
     )
 
 
@@ -90,8 +97,9 @@ def _slope(state: State) -> Array:
     return moved
 
 
-def coefficient_variables(found: WithCoefficients, parameters: Sequence[str]) -> dict[str, Variable]:
+def coefficient_variables(found: WithCoefficients, sensors: Sequence[str]) -> dict[str, Variable]:
     """The joint covariance as a variable of the group `calibration`."""
+    parameters = [f"{s}:{e}" for s in sensors for e in (*MATRIX_ENTRIES, *OFFSET_ENTRIES)]
     names = np.array([*parameters, *found.names])
     values = np.concatenate([np.full(len(parameters), np.nan), found.values])
     attributes = {"units": "products of the parameters' units", "frame": "that of the fit"}
@@ -107,31 +115,38 @@ def taken_off(
     survey: Survey,
     clean: Survey,
     adopted: Sequence[Adopted],
+    theta: Sequence[Array],
     means: Mapping[str, Array],
 ) -> TakenOff | None:
     """What the errors of the coefficients do to a survey that they were taken off; None where they are not known.
+
+    Only the instrument's effects are taken off a survey. A tone and a source that nobody logged are found there anew,
+    with errors of their own that are not in this.
 
     Args:
         calibration: the stored one; fitted: the same, restored.
         survey: as it was read; clean: with the effects taken off.
     """
-    if COVARIANCE not in calibration or not adopted:
+    edges = np.cumsum([0, *(len(t) for t in theta)])
+    applied = [
+        (model, range(edges[i], edges[i + 1]))
+        for i, model in enumerate(adopted)
+        if model.component.effect == "instrument" and model.name not in (TONE, HIDDEN)
+    ]
+    if COVARIANCE not in calibration or not applied:
         return None
     sensors = len(fitted.matrix)
     record = record_of(survey, means=means, every=True)
     raw = np.asarray(clean.values("b_raw"), dtype=float)
     raw = np.where(np.isfinite(raw), raw, np.nanmean(raw, axis=0))  # a lost sample must not spoil its neighbours
     x = record.excitation(raw, as_fitted(calibration, fitted).apply(raw))
-    each = [a.terms(x) for a in adopted]
-    terms = joined(each)
-    # only the instrument's effects are taken off a survey; a tone is found there anew
-    applied = np.concatenate([np.full(e.count, a.component.effect == "instrument" and a.name != TONE)
-                              for a, e in zip(adopted, each, strict=True)])  # fmt: skip
+    terms = joined([model.terms(x) for model, _ in applied])
     response = np.zeros((terms.series.shape[1], 3 * sensors, terms.count))
-    use = (terms.part_output >= 0) & applied[terms.part_term]
+    use = terms.part_output != REFERENCE
     np.add.at(response, (terms.part_series[use], terms.part_output[use], terms.part_term[use]), 1.0)
-    covariance = np.array(calibration.values(COVARIANCE), dtype=float)
     size = 12 * sensors
+    kept = [*range(size), *(size + k for _, own in applied for k in own)]
+    covariance = np.asarray(calibration.values(COVARIANCE), dtype=float)[np.ix_(kept, kept)]
     if "calibration/common_rotation" in calibration:
         turn = np.kron(np.asarray(calibration.values("calibration/common_rotation"), dtype=float), np.eye(3))
         for s in range(sensors):

@@ -297,7 +297,7 @@ def apply_and_refine(
             b, noise = survey.values("calibrated/b"), calibration.values("calibration/noise_std")
             position = calibration.values("calibration/position")
             assembly = stored_assembly(calibration)
-            off = taken_off(calibration, fitted, before, survey, adopted, means)
+            off = taken_off(calibration, fitted, before, survey, adopted, theta, means)
             survey = survey.merged(assembled(assembly, b, position, noise, fitted, refinement, off))
     elif refine_rotation:
         raise DataError(

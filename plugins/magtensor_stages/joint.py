@@ -206,7 +206,6 @@ def _with_error_models(
     worst_error: float,
 ) -> dict[str, Any]:
     """The variables of a survey whose outputs and total field hold declared effects."""
-    from magtensor.calibrated import MATRIX_ENTRIES, OFFSET_ENTRIES
     from magtensor.effect_errors import coefficient_variables, with_coefficients
     from magtensor.loop.model import Adopted, Fitting, joint_state, require_determined
     from magtensor.loop.needs import missing
@@ -227,14 +226,9 @@ def _with_error_models(
         require_determined(record, state, how)
     found = with_coefficients(state)
     calibration = found.calibration
-    if found.open:
-        words = f"{found.open} of {len(found.values)} directions of the coefficients of {', '.join(chosen)}"
-        free = (*calibration.unobservable, f"{words}: no data show them, and they were left zero")
-        calibration = replace(calibration, unobservable=free)
     clean = cleaned(survey, calibration, adopted, state.theta, record.means)
     given = common_frame(clean, calibration, "joint") | effect_variables(adopted, state.theta, record.means)
-    parameters = [f"{s}:{e}" for s in survey.sensors for e in (*MATRIX_ENTRIES, *OFFSET_ENTRIES)]
-    given |= coefficient_variables(found, parameters)
+    given |= coefficient_variables(found, survey.sensors)
     before = np.linalg.norm(survey.values("b_raw"), axis=2) - survey.values("total_field")[:, None]
     given["residual/total_field_before"] = (("time", "sensor"), before, {"units": "nT", "long_name": "|b_raw| - F"})
     doubted = np.zeros(len(survey.time), dtype=bool)

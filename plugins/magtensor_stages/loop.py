@@ -67,6 +67,7 @@ def close_loop(
     """
     from magtensor.calibration.joint import calibrated
     from magtensor.calibration.nominal import Nominal
+    from magtensor.effect_errors import coefficient_variables, with_coefficients
     from magtensor.loop.correction import as_elsewhere
     from magtensor.loop.decisions import Decision, decision_of
     from magtensor.loop.errors_before_after import held_out_error
@@ -104,7 +105,10 @@ def close_loop(
     after = before if same else held_out_error(seen, found.last.adopted, how, found.last.theta, keep)
     found = inquiry.on_every_sample(found)
     first, last, record = found.first, found.last, found.record
-    calibration = calibrated(last.fit)
+    calibration, errors = calibrated(last.fit), {}
+    if last.adopted and last.fit.posterior is None:
+        together = with_coefficients(last)
+        calibration, errors = together.calibration, coefficient_variables(together, survey.sensors)
     doubt = doubt_of(found, how, refused)
     if doubt is not None:
         calibration = labelled(calibration, doubt)
@@ -117,6 +121,7 @@ def close_loop(
         outcome["calibration"] = doubt.facts()
     clean = cleaned(survey, calibration, last.adopted, last.theta, record.means)
     given = common_frame(clean, calibration, "joint") | effect_variables(last.adopted, last.theta, record.means)
+    given |= errors
     before_fit = np.linalg.norm(survey.values("b_raw"), axis=2) - survey.values("total_field")[:, None]
     given["residual/total_field_before"] = (("time", "sensor"), before_fit, {"units": "nT", "long_name": "|b_raw| - F"})
     alone = calibrated(first.fit)

@@ -1,0 +1,52 @@
+"""What the loop does not know of the coefficients it adopts, and where that goes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+from loop_cases import scenario, survey_file
+
+import magtensor
+from magtensor.effect_errors import COVARIANCE
+from magtensor.result import open_result
+from magtensor.session import apply_to
+from magtensor.survey.model import without_variables
+
+
+def test_errors_of_the_coefficients_go_with_the_calibration(tmp_path: Path) -> None:
+    """Far from the mean of the calibration's current, its coefficients' errors are part of the tensor's."""
+    effects = (
+        {"type": "current_field", "rms_nT": 3.0, "channel": "current_heater"},
+        {"type": "site_gradient", "rms_nT": 1.0},
+    )
+    changes = {"logging": {"attitude": True}, "motion": scenario()["motion"] | {"duration_s": 300.0}}
+    survey = survey_file(tmp_path, scenario(5, *effects, **changes))
+    found = magtensor.close_loop(survey, search=["current_field", "site_gradient"])
+    assert {a["error_model"] for a in found.verdict["adopted"]} == {"current_field", "site_gradient"}
+    found.save(tmp_path / "out")
+    stored = open_result(tmp_path / "out" / "calibration.nc")
+    names = [str(n) for n in stored.values("calibration/joint_parameter")]
+    std = dict(zip(names, np.sqrt(np.diag(stored.values(COVARIANCE))), strict=True))
+    told = {
+        (a["error_model"], c["sensor"], c["name"]): c["std"]
+        for a in found.verdict["adopted"]
+        for c in a["coefficients"]
+    }
+    assert len(std) == 48 + len(told)
+    for (model, sensor, name), value in told.items():
+        assert std[":".join(p for p in (model, sensor, name) if p)] == value
+
+    # a site is left behind with the place: another survey need not log what it follows
+    second = survey_file(tmp_path, scenario(6, effects[0], **changes), "other.h5")
+    with h5py.File(second, "r+") as file:
+        del file["attitude"]
+        file["current_heater"][:] = file["current_heater"][:] + 100.0
+    planned = found.computed.planned
+    with_errors, without = (
+        apply_to(given, second, planned).values("calibrated/tensor_std")
+        for given in (stored, without_variables(stored, COVARIANCE))
+    )
+    assert np.isfinite(with_errors).all()
+    assert (with_errors > 1.2 * without).any() and (with_errors >= 0.999 * without).all()
