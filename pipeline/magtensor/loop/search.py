@@ -257,7 +257,9 @@ def simplest(best: Candidate, possible: Sequence[Candidate], state: State) -> tu
         if other is best:
             continue
         ahead = reference.over(_fold_gain(state, colours, other.terms))
-        if ahead.total < SEPARATION or not ahead.consistent:
+        # a coefficient that is not needed costs about one on blocks that it was not fitted to
+        spare = max(other.assessment.estimate.rank - best.assessment.estimate.rank, 0)
+        if ahead.total < SEPARATION + spare or not ahead.consistent:
             equal.append(other)
     chosen = min(
         (c for c in equal if c is best or c.passes),
