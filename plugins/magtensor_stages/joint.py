@@ -62,11 +62,18 @@ OffsetTaken = Annotated[
 ALONE = (
     "calibrate_joint: error_models are fitted to one survey with a measured total field and without a vector reference"
 )
+MEAN_OF_OWN = "calibrate_joint: offset_of: mean needs further surveys with offsets of their own"
 
 
 def declares(options: Mapping[str, Any]) -> Declares:
-    """What is needed depends on what is known of the field."""
+    """What is needed depends on what is known of the field.
+
+    Raises:
+        UsageError: options contradict each other.
+    """
     field = _field(options["total_field"], options["total_field_nT"], options["vector_reference"])
+    together = (options[name] for name in ("attitude_std_deg", "offsets", "offset_of", "error_models"))
+    _require_agreement(field, *together)
     needs = ["b_raw", "total_field"] if field.measured and not field.vector else ["b_raw"]
     needs += ["segment"] if field.kind == "per_segment" else []
     needs += ["attitude", "reference/world_field"] if field.vector else []
@@ -81,6 +88,17 @@ def declares(options: Mapping[str, Any]) -> Declares:
         gives,
         ("residual/contrast", "residual/total_field", "residual/total_field_before", "good"),
     )
+
+
+def _require_agreement(
+    field: joint_surveys.Field, attitude_std_deg: float | None, offsets: str, offset_of: str, error_models: object
+) -> None:
+    if attitude_std_deg is not None and not field.vector:
+        raise UsageError("calibrate_joint: attitude_std_deg needs vector_reference: true; no attitude is used without")
+    if offset_of == "mean" and offsets == "common":
+        raise UsageError(MEAN_OF_OWN)
+    if error_models and (field.vector or not field.measured):
+        raise UsageError(ALONE)
 
 
 def calibrate_recording(
@@ -101,7 +119,8 @@ def calibrate_recording(
     """
     for name, value in others.items():
         if value != _PLAIN[name]:
-            raise UsageError(f"calibrate_joint: {name}: {value} needs the whole survey at once; leave --memory away")
+            said = value if isinstance(value, str | bool | float | int) else f"[{', '.join(value)}]"
+            raise UsageError(f"calibrate_joint: {name}: {said} needs the whole survey at once; leave --memory away")
     with naming(survey):
         calibration, doubted = _from_recording(recording, reference_noise_nT, robust, worst_error)
     return common_frame(survey, calibration, "joint"), doubted
@@ -141,10 +160,16 @@ def calibrate_joint(
 
     field = _field(total_field, total_field_nT, vector_reference)
     several = survey.source is not None and bool(survey.source.further_files())
-    if offset_of == "mean" and (not several or offsets == "common"):
-        raise UsageError("calibrate_joint: offset_of: mean needs further surveys with offsets of their own")
+    _require_agreement(field, attitude_std_deg, offsets, offset_of, error_models)
+    if offset_of == "mean" and not several:
+        raise UsageError(MEAN_OF_OWN)
+    if total_field == "measured" and total_field_nT is not None and joint_surveys.has_measured_field(survey):
+        raise UsageError(
+            f"calibrate_joint: total_field_nT: {total_field_nT:g} would put the survey's measured total field aside; "
+            "leave it out, or say total_field: constant"
+        )
     if error_models:
-        if several or field.vector or not field.measured:
+        if several:
             raise UsageError(ALONE)
         return _with_error_models(survey, dict(error_models), reference_noise_nT, robust, worst_error)
     if several or field.vector or field.kind.startswith("per_"):

@@ -37,6 +37,12 @@ class Field:
         return self.kind == "measured"
 
 
+def has_measured_field(survey: Survey) -> bool:
+    """Whether a reference tells the size of the field; a number that somebody gave does not."""
+    found = next((p for p in ("total_field", "reference/total_field") if p in survey), None)
+    return found is not None and survey[found].attrs.get("origin") != "constant"
+
+
 def usable_samples(survey: Survey, field: Field, name: str) -> np.ndarray:
     """(N,) samples that may enter the fit.
 

@@ -210,6 +210,9 @@ def test_a_vector_reference_ties_the_frame(tmp_path: Path) -> None:
         ("{vector_reference: true}", "", 3, "needs attitude"),
         ("{total_field: per_segment}", ", with: missing.h5", 3, "missing.h5"),
         ("{total_field_nT: 48.5}", "", 2, "greater than 1000"),
+        ("{total_field_nT: 48500}", "", 2, "say total_field: constant"),
+        ("{attitude_std_deg: 0.3}", "", 2, "r.yaml:3: stages[2].calibrate_joint: attitude_std_deg needs vector"),
+        ("{offset_of: mean, offsets: common}", ", with: a.h5", 2, "offsets of their own"),
     ],
 )
 def test_mistakes(tmp_path: Path, options: str, further: str, status: int, said: str) -> None:

@@ -312,7 +312,12 @@ class _Planner:
         if model is None or not whole:
             return None
         described |= model.model_dump(mode="json")
-        return PlannedStage(component, bound | _values(model), described, component.declared(described), tuple(taken))
+        try:
+            declares = component.declared(described)
+        except UsageError as error:  # options that contradict each other
+            self.problems.add(at, str(error).removeprefix(f"{component.name}: "))
+            return None
+        return PlannedStage(component, bound | _values(model), described, declares, tuple(taken))
 
     def method(self, stage: Component, name: Any, at: Location) -> Component | None:
         """The method of a stage that the recipe names; None, with the mistake collected, if there is none."""
