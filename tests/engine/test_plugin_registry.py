@@ -289,3 +289,13 @@ def test_tables_show_brackets_as_they_are(folder, capsys):
     assert "[nT]" in capsys.readouterr().out
     assert status_of(["plugins", "od", "--plugins", str(folder)]) == 2
     assert "did you mean odd" in capsys.readouterr().err
+
+
+def test_a_broken_file_that_was_named_stops_a_run_and_one_beside_it_is_told(folder, caplog, capsys):
+    (folder / "bad.py").write_text("def (")
+    recipe = folder / "recipe.yaml"
+    recipe.write_text("title: t\nstages: [good_stage]\n")
+    assert status_of(["validate", str(recipe), "--plugins", str(folder)]) == 0
+    assert "bad.py could not be loaded: SyntaxError" in caplog.text
+    assert status_of(["validate", str(recipe), "--plugins", str(folder), "--plugins", str(folder / "bad.py")]) == 2
+    assert "bad.py could not be loaded: SyntaxError" in capsys.readouterr().err

@@ -9,10 +9,13 @@ import pytest
 from loop_cases import Array, synthetic
 
 from magtensor.calibration.joint import fit_joint
+from magtensor.components import component_of, error_model
 from magtensor.loop.colour import Colour
 from magtensor.loop.evidence import grams, held_out, normal
-from magtensor.loop.model import Record, excitation_of
+from magtensor.loop.excitation import Excitation
+from magtensor.loop.model import Fitting, Record, excitation_of
 from magtensor.loop.residual import Residual, residual_of, taken_off
+from magtensor.loop.search import search
 from magtensor.loop.statistics import own_information, solve
 from magtensor.loop.terms import REFERENCE, Terms, joined
 
@@ -192,3 +195,15 @@ def test_samples_left_out_leave_the_rest_as_it_was() -> None:
     np.testing.assert_array_equal(few.across, residual.across[[3, 50, 7]])
     np.testing.assert_array_equal(few.samples, residual.samples[[3, 50, 7]])
     assert replace(few, along=None).freedom == few.freedom - 1
+
+
+def test_an_error_model_that_gives_no_terms_is_told_and_in_nobodys_way() -> None:
+    @error_model("instrument", source="s", typical="t")
+    def shapeless(x: Excitation) -> Terms:
+        """Gives an array."""
+        return np.zeros((3, 4))  # type: ignore[return-value]
+
+    component = component_of(shapeless)
+    assert component is not None
+    found = search(synthetic(3, samples=200), [component], Fitting())
+    assert "gives ndarray" in found.failed["shapeless"] and not found.last.adopted

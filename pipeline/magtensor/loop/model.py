@@ -13,6 +13,7 @@ from magtensor.calibration.joint import JointFit, fit_joint, nearest_frame
 from magtensor.calibration.nominal import Nominal, fit_nominal
 from magtensor.calibration.types import Array
 from magtensor.components import Component
+from magtensor.errors import NotEnoughData, UsageError
 from magtensor.loop.assessment import Colours, colours_of, estimated, log_likelihood
 from magtensor.loop.excitation import Excitation
 from magtensor.loop.residual import Residual, residual_of, taken_off
@@ -83,6 +84,21 @@ class Record:
         )  # fmt: skip
 
 
+def regressors(component: Component, x: Excitation, settings: Mapping[str, Any]) -> Terms:
+    """An error model's terms on a survey.
+
+    Raises
+    ------
+    UsageError: the plugin gives something else.
+    """
+    terms = component.function(x, **settings)
+    if not isinstance(terms, Terms):
+        raise UsageError(
+            f"the error model {component.name} gives {type(terms).__name__}; magtensor.loop.terms.Terms would be right"
+        )
+    return terms
+
+
 @dataclass(frozen=True)
 class Adopted:
     """An error model in the calibration.
@@ -103,7 +119,7 @@ class Adopted:
 
     def terms(self, x: Excitation) -> Terms:
         """Its regressors on a survey, those of other sensors left out."""
-        every: Terms = self.component.function(x, **self.settings)
+        every = regressors(self.component, x, self.settings)
         if not self.sensors:
             return every
         return every.only(i for i, s in enumerate(every.sensors) if s in self.sensors or s == "")
@@ -241,7 +257,12 @@ def _fit(record: Record, raw: Array, reference: Array | None, how: Fitting, keep
             return fit_joint(raw, reference, **options)
         return fit_nominal(raw, reference, how.nominal, quiet_field=reference - loud, **options)
 
-    fit = fitted(keep)
+    try:
+        fit = fitted(keep)
+    except NotEnoughData:
+        if not how.complete:  # refused with slack, it is refused without, and by the figures that were asked for
+            _fit(record, raw, reference, replace(how, complete=True), keep)
+        raise
     if keep is not None or fit.keep.all() or not how.searching:
         return fit
     more = borne_out(fit, raw, reference, how.reference_noise)

@@ -10,6 +10,7 @@ import numpy as np
 
 from magtensor.calibration.types import Array
 from magtensor.components import Component
+from magtensor.errors import UsageError
 from magtensor.loop.assessment import (
     WHITE,
     Assessment,
@@ -23,7 +24,7 @@ from magtensor.loop.assessment import (
 from magtensor.loop.evidence import Whitened
 from magtensor.loop.excitation import Excitation
 from magtensor.loop.log_noise import brought_in
-from magtensor.loop.model import Adopted, State
+from magtensor.loop.model import Adopted, State, regressors
 from magtensor.loop.multiplicity import alike, effective_tests, projected
 from magtensor.loop.residual import Residual
 from magtensor.loop.settings import EventTimes, Range
@@ -268,8 +269,8 @@ def _already(state: State, model: Component, settings: Mapping[str, Any]) -> boo
 def _terms(model: Component, settings: Mapping[str, Any], x: Excitation, failed: dict[str, str]) -> Terms | None:
     """The model's regressors; None, and why, where it cannot make them or they are not finite."""
     try:
-        terms: Terms = model.function(x, **settings)
-    except (KeyError, ValueError) as error:
+        terms = regressors(model, x, settings)
+    except (KeyError, ValueError, UsageError) as error:
         failed[model.name] = str(error)
         return None
     if not np.isfinite(terms.series).all():

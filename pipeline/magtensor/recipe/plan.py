@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
@@ -203,8 +204,12 @@ class _Planner:
         self.registry = Registry.load(folders)
         for message in self.registry.problems:
             self.problems.add((), f"plugins: {message}")
+        required += [((), Path(file)) for file in self.plugin_folders if Path(file).is_file()]
         for at, wanted in required:
             self.require(at, wanted)
+        for plugin in self.registry.broken():  # one of a folder's files: it may have nothing to do with this recipe
+            if plugin.file is not None and plugin.file not in {wanted for _, wanted in required}:
+                logging.getLogger(__name__).warning("%s could not be loaded: %s", plugin.file, plugin.error)
         resolved = [
             str((self.document.folder / n).resolve()) if (self.document.folder / n).exists() else n for n in names
         ]
