@@ -154,6 +154,8 @@ class Computed:
         notes = (*(f"not determined: {words}" for words in left_open(self.survey)), *told(self.survey))
         if left := (self.outcome["error"].get("verify") or {}).get("not_taken_off"):
             notes = (*notes, f"NOT taken off the verification survey: {left}")
+        if isinstance(self.survey.source, Source):
+            notes = (*notes, *self.survey.source.named_again())
         return Finished(output, self.outcome, sentence(self.outcome), made_by, self.survey, notes)
 
 

@@ -105,7 +105,11 @@ def gathered(survey: Survey, field: Field) -> tuple[list[str], list[np.ndarray],
     own = str(survey.attributes.get("source", ""))
     surveys = [(own.rsplit("/", 1)[-1] or "this survey", survey), *further]
     names, uses, parts = [], [], []
-    for name, one in surveys:
+    for i, (name, one) in enumerate(surveys):
+        for _, other in surveys[:i]:
+            if np.array_equal(one.values("b_raw"), other.values("b_raw"), equal_nan=True):
+                both = " and ".join(str(s.attributes.get("source", "this survey")) for s in (other, one))
+                raise DataError(f"{both} hold the same samples, which would count twice", hint="name one of them")
         require_sensors(one, survey.sensors, name)
         uses.append(usable_samples(one, field, name))
         parts.append(samples_of(one, uses[-1], field))

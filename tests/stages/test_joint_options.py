@@ -168,6 +168,23 @@ def test_further_surveys(tmp_path: Path) -> None:
     assert changed.exit_code == 3 and "c.h5" in changed.output and "has changed" in changed.output
 
 
+def test_no_survey_counts_twice(tmp_path: Path) -> None:
+    for name, seed in (("a", 3), ("b", 4)):
+        written(tmp_path / f"{name}.h5", seed, samples=600)
+    stages = "[load, calibrate_joint: {total_field: constant}]"
+    once = run(tmp_path, stages, further=", with: b.h5")
+    assert once.exit_code == 0 and "named more than once" not in once.output, once.output
+    variances = matrix_of(tmp_path / "out/calibration.nc")[0]["calibration/covariance"].values
+    again = run(tmp_path, stages, further=", with: [a.h5, b.h5, ./b.h5, '[b]*.h5']")
+    assert again.exit_code == 0, again.output
+    assert again.output.count("b.h5 is named more than once") == again.output.count("a.h5 is named more than once") == 1
+    found = matrix_of(tmp_path / "out/calibration.nc")[0]["calibration/covariance"].values
+    np.testing.assert_array_equal(found, variances)
+    (tmp_path / "copy.h5").write_bytes((tmp_path / "a.h5").read_bytes())
+    copied = run(tmp_path, stages, further=", with: [b.h5, copy.h5]")
+    assert copied.exit_code == 3 and "a.h5 and " in copied.output and "copy.h5 hold the same samples" in copied.output
+
+
 def test_offsets_for_another_survey_are_declared_and_told(tmp_path: Path) -> None:
     for name, seed in (("a", 3), ("b", 4), ("c", 5), ("d", 6)):
         written(tmp_path / f"{name}.h5", seed, samples=600, apart_nT=30.0, reference=True)

@@ -200,6 +200,11 @@ def test_a_canonical_survey_with_another_reference(tmp_path: Path, load_section:
     np.testing.assert_array_equal(survey.values("reference/time"), np.arange(50))
     constant = load_section({"file": "s.nc", "reference": {"constant": {"value": 48_000, "units": "nT"}}})
     assert set(constant.values("reference/total_field")) == {48_000.0}
+    world = load_section({"file": "s.nc", "reference": {"world_field": {"value": [0, 20, -40], "units": "uT"}}})
+    np.testing.assert_array_equal(world.values("reference/world_field"), [0, 20e3, -40e3])
+    own = load_section({"file": "s.nc"})
+    np.testing.assert_array_equal(world.values("reference/total_field"), own.values("reference/total_field"))
+    np.testing.assert_array_equal(world.values("reference/time"), own.values("reference/time"))
 
 
 def test_attitude_conventions(tmp_path: Path, load_section: Load) -> None:
@@ -291,6 +296,7 @@ def test_what_the_file_does_not_have(tmp_path: Path, load_section: Load, section
         ({"file": "a.h5", "time": {"rate_Hz": 10}}, "a mapping needs `sensors`"),
         ({"file": "a.h5", "sensors": {"A": {"from": [1]}}, "time": {"rate_Hz": 10, "from": "t"}}, "either `from`"),
         ({"file": "a.h5", "sensors": {"A": {"from": [1]}}, "reference": {}}, "give one of total_field, components"),
+        ({"file": "a.h5", "reference": {"world_field": {"value": [1, 2], "units": "uT"}}}, "must be three numbers"),
         ({"file": "a.h5", "sensors": {"A": {"from": [1]}}, "attitude": {"from": "q"}}, "say where the quaternion's"),
         (
             {"file": "a.h5", "sensors": {"A": {"from": [1], "position": [0, 0, 0]}, "B": {"from": [2]}}},

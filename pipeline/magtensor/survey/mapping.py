@@ -16,6 +16,7 @@ from magtensor.survey.flags import Flag, flag_ranges
 from magtensor.survey.model import AXES, Survey
 from magtensor.survey.quantities import Rows, interpolated, listed, quantity, rows_of
 from magtensor.survey.sections import (
+    REFERENCE_KINDS,
     AltitudeSection,
     AttitudeSection,
     ChannelSection,
@@ -242,11 +243,16 @@ def mapped(source: Source) -> Survey:
 def with_reference(survey: Survey, source: Source) -> Survey:
     """A survey in the canonical layout, with the section's reference in place of its own.
 
+    A `world_field` alone tells the direction: the survey keeps the total field that it has.
+
     Raises:
         DataError, UsageError: as `mapped`.
     """
     section = source.section.reference
     assert section is not None
+    alone = all(getattr(section, kind) is None for kind in REFERENCE_KINDS)
+    if alone and "reference/total_field" in survey:
+        return survey.merged(_world(section))
     parts = split_since(str(survey["time"].attrs["units"]))
     assert parts is not None
     epoch = parts[1]

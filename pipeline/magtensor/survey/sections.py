@@ -214,6 +214,13 @@ class VectorSection(Section):
     value: tuple[float, float, float] = Field(description="its components in the world frame")
     units: Annotated[Units, _dimension_check("magnetic flux density")] = Field(description="nT, uT, ...")
 
+    @field_validator("value", mode="before")
+    @classmethod
+    def _three(cls, value: Any) -> Any:
+        if not isinstance(value, (list, tuple)) or len(value) != 3:
+            raise ValueError("must be three numbers, the components x, y and z in the world frame")
+        return tuple(value)
+
 
 class ConstantSection(Section):
     """A total field that is taken as constant."""

@@ -83,15 +83,31 @@ class Source:
         return list(dict.fromkeys([*own, *self.further_files()]))
 
     def further_files(self) -> list[Path]:
-        """The further surveys that the section names, this one left out.
+        """The further surveys that the section names, each once, this one left out.
 
         Raises:
             DataError: as in `files`.
         """
+        return [file for file, again in self._named_further() if not again]
+
+    def named_again(self) -> list[str]:
+        """What to say of files that `with` names although the fit has them already.
+
+        Raises:
+            DataError: as in `files`.
+        """
+        names = dict.fromkeys(file.name for file, again in self._named_further() if again)
+        return [f"{name} is named more than once (survey: with) and is used once" for name in names]
+
+    def _named_further(self) -> list[tuple[Path, bool]]:
+        """Every file that `with` names, and whether it was named before."""
         names = self.section.with_ or []
-        named = FileSection(files=[names] if isinstance(names, str) else names)
-        own = {f.resolve() for f in self.paths(self.section)}
-        return list(dict.fromkeys(f for f in self.paths(named) if f.resolve() not in own))
+        taken = {file.resolve() for file in self.paths(self.section)}
+        found = []
+        for file in self.paths(FileSection(files=[names] if isinstance(names, str) else names)):
+            found.append((file, file.resolve() in taken))
+            taken.add(file.resolve())
+        return found
 
     def further_surveys(self) -> list[tuple[str, Survey]]:
         """Name and content of each of them, prepared by the recipe's own stages."""
