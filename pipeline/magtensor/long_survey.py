@@ -184,6 +184,11 @@ def _require_windows(planned: Plan) -> None:
         raise UsageError(
             f"{planned.file}: {name} the whole survey at once; with --memory calibrate with {', '.join(able)}"
         )
+    if "total_field" not in rest[0].declares.needs:
+        raise UsageError(
+            f"{planned.file}: {rest[0].name} without a measured total field (total_field: constant and the like) needs "
+            "the whole survey at once; leave --memory away"
+        )
     for stage in rest[1:]:
         if any(p.startswith("calibration/matrix") for p in stage.declares.gives):
             raise UsageError(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
@@ -11,6 +12,7 @@ from pydantic import Field
 from magtensor import metric
 from magtensor.accuracy import COMPONENTS, error_block, figure, rms
 from magtensor.calibrated import left_open
+from magtensor.calibration.common_scale import COMMON_SCALE
 from magtensor.calibration.noise import noise_std
 from magtensor.qc import Verdict
 
@@ -21,19 +23,27 @@ Ratio = Annotated[float, Field(gt=1, description="times the noise above which th
 Share = Annotated[float, Field(gt=0, lt=1, description="share of the samples")]
 
 
-@metric(needs=("calibrated/b", "total_field"))
+@metric(needs=("calibrated/b", "total_field"), uses=("calibration/matrix",))
 def total_field(survey: Survey, *, warn_ratio: Ratio = 1.5, fail_ratio: Ratio = 30.0) -> list[Verdict]:
     """RMS of |b| - F of each sensor against its noise along the field.
 
-    The noise is that of second differences of the residual: what the fit leaves above it is slower than noise.
+    The noise is that of second differences of the residual: what the fit leaves above it is slower than noise. Where
+    the calibration says that its scale was not measured, |b| is compared after the one scale that fits F best.
     """
     b, reference = survey.values("calibrated/b"), survey.values("total_field")
+    known = survey.good_by_sensor & np.isfinite(reference)[:, None]
+    free = any(words.startswith(COMMON_SCALE) for words in left_open(survey))
+    if free and known.any():
+        size, field = np.linalg.norm(b, axis=2)[known], np.broadcast_to(reference[:, None], known.shape)[known]
+        b = b * float(np.dot(size, field) / np.dot(size, size))
     verdicts = []
     for i, sensor in enumerate(survey.sensors):
-        good = survey.good_by_sensor[:, i] & np.isfinite(reference)
+        good = known[:, i]
         residual = np.linalg.norm(b[good, i], axis=1) - reference[good]
         floor = float(noise_std(b[good, i : i + 1], reference[good])[0, 0])
         verdicts.append(_against_noise(f"total_field_rms {sensor}", rms(residual), floor, "nT", warn_ratio, fail_ratio))
+    if free:
+        verdicts = [replace(v, words=f"{v.words} (after the scale that was not measured)") for v in verdicts]
     return verdicts
 
 

@@ -296,6 +296,7 @@ def _from_surveys(
     mean: bool,
 ) -> tuple[ArrayCalibration, dict[str, Any], np.ndarray]:
     """The calibration, what else is told of it, and the samples (N,) of this survey that no noise explains."""
+    from magtensor.calibration.common_scale import COMMON_SCALE
     from magtensor.calibration.surveys.corrections import calibrated_surveys
     from magtensor.calibration.surveys.fit import fit_surveys
 
@@ -317,7 +318,7 @@ def _from_surveys(
         calibration, factor = _without_reference(calibration, field, float(np.mean(fit.found.sums.total_field)))
         found = found if field.declared is not None else found.nominal()
     elif field.vector and ("total_field" not in survey or survey["total_field"].attrs.get("origin") == "constant"):
-        words = "one scale that all sensors share: the size of the world field was declared, not measured"
+        words = f"{COMMON_SCALE}: the size of the world field was declared, not measured"
         calibration = replace(calibration, unobservable=(*calibration.unobservable, words))
     extra = joint_surveys.survey_variables(names, fit, found, survey.sensors, factor)
     if words := joint_surveys.offset_words(names, found, mean):

@@ -124,6 +124,33 @@ def test_without_a_reference(tmp_path: Path) -> None:
     assert applied.exit_code == 0, applied.output
 
 
+def test_a_scale_that_was_not_measured_fails_no_verdict(tmp_path: Path) -> None:
+    written(tmp_path / "a.h5", 3, reference=True)  # a wrong size of 1000 nT: 5000 times the noise
+    joint = f"calibrate_joint: {{total_field: constant, total_field_nT: {FIELD_NT + 1000.0}}}"
+    done = run(tmp_path, f"[load, detrend_diurnal, {joint}, qc]")
+    assert done.exit_code == 0 and "QC failed" not in done.output, done.output
+    tree, _ = matrix_of(tmp_path / "out/result.nc")
+    state = dict(zip(tree["qc/metric"].values, tree["qc/state"].values, strict=True))
+    assert [state[f"total_field_rms S{i + 1}"] for i in range(SENSORS)] == ["pass"] * SENSORS
+    assert "after the scale that was not measured" in str(tree["qc/words"].values)
+    # a field that varies is not what the scale explains
+    with h5py.File(tmp_path / "a.h5", "r+") as file:
+        file["reference/total_field"][:] += np.linspace(0, 100, len(file["reference/total_field"]))
+    assert "QC failed: total_field_rms" in run(tmp_path, f"[load, detrend_diurnal, {joint}, qc]").output
+
+
+def test_what_needs_the_whole_survey_at_once(tmp_path: Path) -> None:
+    written(tmp_path / "a.h5", 3, samples=600, reference=True)
+    recipe = tmp_path / "r.yaml"
+    for options, said in (
+        ("{total_field: constant}", "total_field: constant and the like) needs the whole survey"),
+        ("{error_models: [temperature_offset]}", "error_models: [temperature_offset] needs the whole survey"),
+    ):
+        recipe.write_text(f"title: t\nsurvey: a.h5\nstages: [load, detrend_diurnal, calibrate_joint: {options}]\n")
+        done = command("run", recipe, "--output", tmp_path / "out", "--memory", 1)
+        assert done.exit_code == 2 and said in done.output, done.output
+
+
 def test_a_declared_total_field(tmp_path: Path) -> None:
     written(tmp_path / "a.h5", 3)
     done = run(tmp_path, f"[load, calibrate_joint: {{total_field_nT: {FIELD_NT}}}]")

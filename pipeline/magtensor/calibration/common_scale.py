@@ -13,8 +13,9 @@ import numpy as np
 
 from .types import Array, ArrayCalibration
 
-UNKNOWN = "one scale that all sensors share: the mean sensitivity was taken as nominal, as no total field was measured"
-DECLARED = "one scale that all sensors share: the total field was declared, not measured"
+COMMON_SCALE = "one scale that all sensors share"  # how the words begin that name the scale as unobservable
+UNKNOWN = f"{COMMON_SCALE}: the mean sensitivity was taken as nominal, as no total field was measured"
+DECLARED = f"{COMMON_SCALE}: the total field was declared, not measured"
 
 
 @dataclass(frozen=True)
