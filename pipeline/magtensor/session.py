@@ -272,7 +272,7 @@ def apply_and_refine(
     """
     from magtensor.calibrated import corrected, require_positions, require_sensors, restored
     from magtensor.effect_errors import taken_off
-    from magtensor.loop.stored import cleaned, left_in, stored_effects
+    from magtensor.loop.stored import cleaned, left_in, on_its_clock, stored_effects
     from magtensor.platform_frame import as_fitted, with_refined_rotation
     from magtensor.standing_out import flagged
     from magtensor.tensor.elements import five
@@ -287,6 +287,7 @@ def apply_and_refine(
             require_positions(survey, calibration.values("calibration/position"), str(path))
         fitted = restored(calibration)
         adopted, theta, means = stored_effects(calibration, planned.registry)
+        adopted = on_its_clock(adopted, calibration, survey)
         before, survey = survey, cleaned(survey, as_fitted(calibration, fitted), adopted, theta, means)
         if judge:
             known = calibration.values("calibration/noise_std") if "calibration/noise_std" in calibration else None

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from magtensor.calibration.types import Array, ArrayCalibration
+from magtensor.errors import NotEnoughData
 from magtensor.survey.model import AXES, Survey, Variable
 from magtensor.tensor.assembly import Assembly, unconstrained_assembly
 from magtensor.tensor.elements import FIVE_OF_NINE, NINE_OF_FIVE, closure, five, full
@@ -157,7 +158,10 @@ def stored_refinement(calibration: Survey) -> tuple[Array, Array, Array] | None:
 
 def closure_variables(b: Array, position: Array) -> dict[str, Variable]:
     """`residual/closure`: trace and asymmetries of the separately measured derivatives, nT/m, as far as measured."""
-    measured = unconstrained_assembly(position).apply(b)
+    try:
+        measured = unconstrained_assembly(position).apply(b)
+    except NotEnoughData:  # sensors in a plane oblique to the axes measure none of them separately
+        return {}
     found = {name: values for name, values in closure(measured).items() if np.isfinite(values).any()}
     if not found:
         return {}

@@ -252,7 +252,7 @@ def _with_error_models(
     found = with_coefficients(state)
     calibration = found.calibration
     clean = cleaned(survey, calibration, adopted, state.theta, record.means)
-    given = common_frame(clean, calibration, "joint") | effect_variables(adopted, state.theta, record.means)
+    given = common_frame(clean, calibration, "joint") | effect_variables(adopted, state.theta, record.means, survey)
     given |= coefficient_variables(found, survey.sensors)
     before = np.linalg.norm(survey.values("b_raw"), axis=2) - survey.values("total_field")[:, None]
     given["residual/total_field_before"] = (("time", "sensor"), before, {"units": "nT", "long_name": "|b_raw| - F"})

@@ -7,6 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 import xarray as xr
@@ -170,3 +171,23 @@ def test_importing_is_light() -> None:
     )
     said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert said.stdout.strip() == "[]"
+
+
+def test_a_jump_lasts_into_later_surveys(tmp_path: Path) -> None:
+    """The same sensors' last minutes as a survey of their own, whose start lies after the jump."""
+    jump = {"type": "offset_step", "rms_nT": 3.0, "time_s": [300.0]}
+    whole = survey_file(tmp_path, scenario(5, jump, motion=scenario()["motion"] | {"duration_s": 600.0}))
+    later = tmp_path / "later.h5"
+    with h5py.File(whole) as old, h5py.File(later, "w") as new:
+        keep = old["time"][:] > 350.0
+        names = [n for n, o in old.items() if isinstance(o, h5py.Dataset)]
+        for name in (*names, "reference/time", "reference/total_field"):
+            item = old[name]
+            new[name] = item[keep] if item.shape[:1] == keep.shape else item[()]
+            if "units" in item.attrs:
+                new[name].attrs["units"] = item.attrs["units"]
+    found = magtensor.close_loop(whole, search=["offset_step"])
+    assert [a["error_model"] for a in found.verdict["adopted"]] == ["offset_step"]
+    b = found.calibration.apply(later)["calibrated/b"].values
+    contrast = b - b.mean(axis=1, keepdims=True)
+    assert np.sqrt(np.mean(contrast**2)) < 1.3 * 0.15

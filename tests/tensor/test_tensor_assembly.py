@@ -14,6 +14,7 @@ from magtensor.tensor.uncertainty import (
     noise_tensor_std,
     tensor_std,
 )
+from magtensor.tensors import closure_variables
 from magtensor_methods.tensor_cross import chi2017_cross, li2018_cross
 from magtensor_methods.tensor_least_squares import least_squares
 
@@ -336,3 +337,9 @@ def test_pieces_of_a_long_record_agree_with_the_whole():
     std = tensor_std(assembly, b, calibration=calibration)
     pick = rng.integers(0, len(b), 20)
     np.testing.assert_allclose(std[pick], tensor_std(assembly, b[pick], calibration=calibration), rtol=1e-9)
+
+
+def test_an_oblique_plane_has_a_tensor_and_no_closure() -> None:
+    """Three sensors in a plane that is oblique to all axes determine the tensor, and no derivative alone."""
+    position = np.array([[0.35, 0.0, 0.0], [-0.2, 0.3, 0.0], [-0.2, -0.3, 0.05]])
+    assert closure_variables(np.zeros((4, 3, 3)), position) == {}

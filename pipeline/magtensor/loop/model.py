@@ -107,11 +107,13 @@ class Adopted:
         component: the plugin's function with its kind.
         settings: chosen values.
         sensors: names of the sensors it acts on; () for one that is not of single sensors.
+        start: s on the survey's clock, from which its times count; None for the survey's own start.
     """
 
     component: Component
     settings: Mapping[str, Any]
     sensors: tuple[str, ...] = ()
+    start: float | None = None
 
     @property
     def name(self) -> str:
@@ -119,6 +121,8 @@ class Adopted:
 
     def terms(self, x: Excitation) -> Terms:
         """Its regressors on a survey, those of other sensors left out."""
+        if self.start is not None:
+            x = replace(x, start=self.start)
         every = regressors(self.component, x, self.settings)
         if not self.sensors:
             return every

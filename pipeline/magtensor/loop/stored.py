@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from datetime import datetime, timedelta
 from typing import Any
 
 import numpy as np
@@ -15,16 +17,17 @@ from magtensor.loop.model import Adopted, Record
 from magtensor.loop.needs import FACTS
 from magtensor.loop.record import record_of
 from magtensor.loop.screening import profiled
-from magtensor.loop.settings import AnyChannel
+from magtensor.loop.settings import AnyChannel, Duration, EventTimes
 from magtensor.loop.waveform import NAME
 from magtensor.registry import Registry
 from magtensor.survey.model import Survey, Variable
+from magtensor.survey.times import split_since
 
 
 def effect_variables(
-    adopted: Sequence[Adopted], theta: Sequence[Array], means: Mapping[str, Array]
+    adopted: Sequence[Adopted], theta: Sequence[Array], means: Mapping[str, Array], survey: Survey
 ) -> dict[str, Variable]:
-    """The effects as a variable of the group `calibration`; nothing where there are none."""
+    """The effects found on a survey as a variable of the group `calibration`; nothing where there are none."""
     if not adopted:
         return {}
     texts = [
@@ -41,6 +44,7 @@ def effect_variables(
         for a, t in zip(adopted, theta, strict=True)
     ]
     attributes = {"channel_means": json.dumps({k: np.asarray(v).tolist() for k, v in means.items()})}
+    attributes["start"] = _started(survey).isoformat()
     return {"calibration/effects": (("effect",), np.array(texts, dtype=np.str_), attributes)}
 
 
@@ -64,6 +68,29 @@ def stored_effects(calibration: Survey, registry: Registry) -> tuple[list[Adopte
         theta.append(np.asarray(facts["theta"], dtype=float))
     means = {k: np.asarray(v, dtype=float) for k, v in json.loads(variable.attrs["channel_means"]).items()}
     return adopted, theta, means
+
+
+def on_its_clock(adopted: Sequence[Adopted], calibration: Survey, survey: Survey) -> list[Adopted]:
+    """Effects of a calibration as they are on another survey: what happened at a time has happened since then.
+
+    A jump stays, and a drift holds its last value. Warming up begins anew with every survey.
+    """
+    begun = calibration["calibration/effects"].attrs.get("start") if adopted else None
+    if begun is None:
+        return list(adopted)
+    seconds = (datetime.fromisoformat(str(begun)) - _started(survey)).total_seconds() + float(survey.time[0])
+    return [replace(a, start=seconds) if _of_a_time(a) else a for a in adopted]
+
+
+def _of_a_time(model: Adopted) -> bool:
+    """Whether a setting is a time, or the length, of the survey that the model was fitted to."""
+    return any(isinstance(mark, (EventTimes, Duration)) for mark in profiled(model.component).values())
+
+
+def _started(survey: Survey) -> datetime:
+    parts = split_since(str(survey["time"].attrs["units"]))
+    assert parts is not None
+    return parts[1] + timedelta(seconds=float(survey.time[0]))
 
 
 def cleaned(
