@@ -14,6 +14,7 @@ from magtensor.calibration.joint import calibrated
 from magtensor.calibration.types import Array
 from magtensor.components import Component
 from magtensor.errors import DataError, NotEnoughData, UsageError, did_you_mean
+from magtensor.loop.assessment import estimated
 from magtensor.loop.decisions import Decision
 from magtensor.loop.latent import NAME, renewed, sought, tried_source
 from magtensor.loop.long_record import on_every_sample, part_of
@@ -21,12 +22,14 @@ from magtensor.loop.model import Adopted, Fitting, Record, State, joint_state, w
 from magtensor.loop.needs import missing
 from magtensor.loop.outcome import described, removal, why
 from magtensor.loop.record import record_of
-from magtensor.loop.screening import Candidate, candidates_of, repeatable
+from magtensor.loop.screening import Candidate, candidates_of, profiled, repeatable
 from magtensor.loop.search import Search, Step, adopt, search, simplest, with_lines
+from magtensor.loop.settings import AnyChannel
 from magtensor.loop.trial import trial
 from magtensor.survey.model import Survey
 
 PERSON, LOOP, DECLARED = "person", "loop", "declared"
+_ADOPTED = "{} is adopted already; reject it or undo first to adopt it otherwise"
 
 
 @dataclass(frozen=True)
@@ -176,6 +179,7 @@ class Inquiry:
             return self._adopt_source(component, decision)
         chosen = self._candidate(component, given)
         before = self.now
+        _require_new_direction(chosen, before.state)
         standing = trial(before.record, before.state, self.how)
         after = trial(before.record, adopt(before.record, before.state, chosen, self.how), self.how)
         record, state = renewed(before.record, after.state, self.how)
@@ -324,6 +328,8 @@ class Inquiry:
         self._ranked = None
 
     def _known(self, name: str) -> Component:
+        if not isinstance(name, str):
+            raise UsageError(f"an error model is given by its name, not as {name!r}")
         for model in self.models:
             if model.name == name:
                 return model
@@ -336,7 +342,7 @@ class Inquiry:
     def _open(self, name: str) -> Component:
         component = self._known(name)
         if name in {a.name for a in self.now.state.adopted} and not repeatable(component):
-            raise UsageError(f"{name} is adopted already; reject it or undo first to adopt it otherwise")
+            raise UsageError(_ADOPTED.format(name))
         if lacks := self.lacks(component):
             logged = ", ".join(sorted(self.first.excitation.logged)) or "no channel"
             raise DataError(f"{name} needs {' and '.join(lacks)}, which this survey lacks; it logs {logged}")
@@ -348,13 +354,18 @@ class Inquiry:
             for candidate in self.ranking():
                 if candidate.model.name == component.name:
                     return candidate
+        channels = [n for n, g in profiled(component).items() if isinstance(g, AnyChannel) and n in given]
         for adopted in self.now.state.adopted:
             if adopted.name == component.name and given.items() <= adopted.settings.items():
                 raise UsageError(f"{component.name} is adopted already with these settings")
+            if adopted.name == component.name and any(adopted.settings.get(c) == given.get(c) for c in channels):
+                raise UsageError(_ADOPTED.format(component.name))
         failed: dict[str, str] = {}
         state = with_lines(self.now.state, self.now.record, self._part.lines)
         found = candidates_of(state, [pinned(component, given)], failed, self.alpha)
         if not found:
+            if component.name not in failed and component.name in {a.name for a in self.now.state.adopted}:
+                raise UsageError(_ADOPTED.format(component.name))
             reason = failed.get(component.name, "it has no regressor here that the calibration does not have already")
             raise DataError(f"{component.name} cannot be fitted to this survey: {reason}")
         models = max(len(self.open_models()), 1)
@@ -407,6 +418,21 @@ def pinned(component: Component, settings: Mapping[str, Any]) -> Component:
     held.__signature__ = inspect.Signature([first, *free])  # type: ignore[attr-defined]
     held.__doc__ = component.function.__doc__
     return replace(component, function=held)
+
+
+def _require_new_direction(chosen: Candidate, state: State) -> None:
+    """Refuse a model whose regressors C, o and the adopted models can make already: its coefficients would be nothing.
+
+    Raises:
+        DataError: it is one.
+    """
+    known = 0 if state.terms is None else estimated(state.residual, state.terms, chosen.assessment.colours).rank
+    if chosen.assessment.estimate.rank <= known:
+        settings = "".join(f" {k}={v}" for k, v in chosen.model.settings.items())
+        raise DataError(
+            f"{chosen.model.name}{settings} cannot be told from the calibration as it is: it has no direction on this "
+            "survey that C, o and what is adopted do not have already"
+        )
 
 
 def _judged(candidate: Candidate) -> str:
