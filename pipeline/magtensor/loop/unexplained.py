@@ -52,9 +52,10 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
         words.append(f"a line at {line[0]:.4g} Hz (period {1 / line[0]:.4g} s), {line[1]:.3g} nT rms")
     if turning > 0:
         words.append(f"{turning:.3g} nT rms of it can be predicted from the direction of the field and how it turns")
-    if suspects:
-        names = ", ".join(c.model.name for c in suspects)
-        words.append(f"significant but of no use on held-out blocks: {names}")
+    if open_ := [c.model.name for c in suspects if c.passes]:
+        words.append(f"significant, predicts held-out blocks and is not adopted: {', '.join(open_)}")
+    if useless := [c.model.name for c in suspects if not c.passes]:
+        words.append(f"significant but of no use on held-out blocks: {', '.join(useless)}")
     if words:
         words.insert(0, f"{excess:.3g} nT rms above the white noise, mostly on {_sensors(state)}")
     if flagged.any():
