@@ -23,7 +23,7 @@ from magtensor.loop.unexplained import unexplained
 from magtensor.recipe.plan import Plan, plan
 from magtensor.recipe.source import Document
 from magtensor.runner import run_stage
-from magtensor.session import Computed, Finished, empty_survey, verification
+from magtensor.session import Computed, Finished, empty_survey, load_as, require_unseen, verification
 from magtensor.survey.in_memory import Held, SurveyLike, given_survey
 from magtensor.verdict import verdict
 
@@ -75,6 +75,10 @@ class Explorer:
         self._place = next((i for i, s in enumerate(self._planned.stages) if s.name == STAGE), -1)
         if self._place < 0:
             raise UsageError(f"{document.file}: the recipe has no stage {STAGE}, there is nothing to explore")
+        if self._verify is not None:
+            if isinstance(self._verify, Path):
+                require_unseen(self._verify, self.sources)
+            load_as(self._planned, self._verify)  # refused now if it cannot be read, not at the end
         survey = empty_survey(given if isinstance(given, Held) else self._planned)
         records = []
         for stage in self._planned.stages[: self._place]:
@@ -219,7 +223,7 @@ class Explorer:
         path = Path(path)
         folders = [*self._folders, *([path] if path.resolve() not in {f.resolve() for f in self._folders} else [])]
         planned = self._plan(folders, None)
-        broken = [p for p in planned.registry.broken() if p.file is not None and p.file.is_relative_to(path)]
+        broken = [p for p in planned.registry.broken() if p.file is not None and _lies_in(p.file, path)]
         if broken:
             raise UsageError(f"{broken[0].file} cannot be loaded: {broken[0].error}")
         before = {m.name: m.function for m in self._inquiry.models}
@@ -228,8 +232,11 @@ class Explorer:
         for model in given:
             if not inquiry.lacks(model):
                 _try(model, self._inquiry)
-        if not given and not any(p.file is not None and p.file.is_relative_to(path) for p in planned.registry.plugins):
-            raise UsageError(f"{path} gives no error model")
+        if not given and not any(
+            c.kind == "error_model" and (file := planned.registry.origin[key].file) and _lies_in(file, path)
+            for key, c in planned.registry.components.items()
+        ):
+            raise UsageError(f"{path} gives no error model: mark a function with @error_model")
         if any(m.name in before for m in given):
             for decision, _ in self._inquiry.now.made:
                 inquiry.decide(decision)
@@ -350,6 +357,10 @@ def _try(model: Any, inquiry: Inquiry) -> None:
         raise
     except Exception as error:
         raise UsageError(f"{model.name} fails on this survey: {type(error).__name__}: {error}") from error
+
+
+def _lies_in(file: Path, path: Path) -> bool:
+    return file.resolve().is_relative_to(path.resolve())
 
 
 def _short(value: Any) -> str:

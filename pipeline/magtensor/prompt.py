@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shlex
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -73,7 +74,7 @@ def converse(
     console = Console(highlight=False, soft_wrap=True, width=None if sys.stdout.isatty() else 160)
     explorer = Explorer(document, given, verify=verify, plugins=plugins)
     refuse_overwriting([directory / "result.nc"], [*explorer.sources, *([verify] if verify else [])])
-    session = Session(explorer, console, directory, _journal(file, directory))
+    session = Session(explorer, console, directory, _journal(file, directory, survey))
     console.print(f"{file}: `help` lists the commands")
     session.status()
     session.run(_typed() if sys.stdin.isatty() else _piped(console))
@@ -103,7 +104,7 @@ class Session:
 
     def run(self, lines: Iterator[str]) -> None:
         """Take commands until there are no more; a mistake costs one line, and the session goes on."""
-        self._written = self.explorer.decisions
+        self._written = self.explorer.decisions if self.journal.exists() else []
         for line in lines:
             text = line.split("#", 1)[0].strip()
             if not text:
@@ -186,7 +187,7 @@ class Session:
 
     def load(self, path: str) -> None:
         """A plugin file."""
-        words = shlex.split(path)
+        words = _words(path)
         if len(words) != 1:
             raise UsageError("write `load FILE`")
         names = self.explorer.load_plugin(words[0])
@@ -194,6 +195,8 @@ class Session:
 
     def show(self, name: str) -> None:
         """An error model."""
+        if not name:
+            raise UsageError("write `show NAME`; `ranking` lists error models")
         component = self.explorer.registry.find("error_model", name)
         self._say(f"{component.name} ({component.effect}; typically {component.typical or 'not said'})")
         self._say(component.summary)
@@ -213,7 +216,9 @@ class Session:
 
     def save(self, folder: str) -> None:
         """The result."""
-        words = shlex.split(folder)
+        words = _words(folder)
+        if len(words) > 1:
+            raise UsageError("write `save [FOLDER]`; a name with blanks needs quotes")
         directory = Path(words[0]) if words else self.directory
         refuse_overwriting([directory / "result.nc"], self.explorer.sources)
         require_writable(directory)
@@ -238,6 +243,13 @@ class Session:
     def _end(self) -> None:
         if self.saved == self.explorer.decisions or not self.explorer.decisions:
             return
+        try:
+            self._keep()
+        except MagtensorError as error:
+            self.refuse(str(error))
+            made = "; ".join(decision for decision, _ in self.explorer.decisions)
+            self._say(f"not saved as a result, and no file holds the decisions: {made}")
+            return
         self._say(
             f"not saved as a result; {self.journal} holds the decisions: `magtensor explore {self.journal}` takes them "
             f"up, `magtensor run {self.journal}` makes the result"
@@ -256,14 +268,17 @@ class Session:
         return table
 
 
-def _journal(file: Path, directory: Path) -> Path:
-    """A session goes on in its own file; another recipe's stays beside it, so that relative names still hold."""
+def _journal(file: Path, directory: Path, survey: Path | None) -> Path:
+    """A session goes on in its own file, unless with another survey; another recipe's stays beside it, so that
+    relative names still hold."""
     if file.suffix.lower() not in RECIPES:
         folder, stem = directory, file.stem
-    elif any(isinstance(s, dict) and (s.get(STAGE) or {}).get("decisions") for s in load_yaml(file).value["stages"]):
+    elif survey is None and any(
+        isinstance(s, dict) and (s.get(STAGE) or {}).get("decisions") for s in load_yaml(file).value["stages"]
+    ):
         return file
     else:
-        folder, stem = file.parent, file.stem
+        folder, stem = file.parent, re.sub(r"\.session-\d+$", "", file.stem)
     number = 1
     while (folder / f"{stem}.session-{number}.yaml").exists():
         number += 1
@@ -288,6 +303,13 @@ def _piped(console: Console) -> Iterator[str]:
     for line in sys.stdin:
         console.print(f"{PROMPT}{line.rstrip()}", markup=False)
         yield line
+
+
+def _words(text: str) -> list[str]:
+    try:
+        return shlex.split(text)
+    except ValueError as error:
+        raise UsageError(f"{text!r} cannot be read: {error}") from error
 
 
 def _place(error: Exception) -> str:

@@ -114,8 +114,8 @@ def run_plan(
     require_writable(output)
     files = planned.source().files()
     refuse_overwriting([output / name for name in result.FILES], [*files, *([verify] if verify else [])])
-    if verify is not None and verify.resolve() in {f.resolve() for f in files}:
-        raise UsageError(f"{verify}: this is the survey itself; a verification survey is one that the fit has not seen")
+    if verify is not None:
+        require_unseen(verify, files)
     if progress is not None:
         progress("start")
     if memory_GiB is not None:
@@ -123,6 +123,16 @@ def run_plan(
 
         return run_long(planned, output, memory_GiB, verify=verify, progress=progress)
     return compute(planned, empty_survey(planned), verify=verify, progress=progress).write(output)
+
+
+def require_unseen(verify: Path, files: Sequence[Path]) -> None:
+    """See that a verification survey is none of the files that the survey is read from.
+
+    Raises:
+        UsageError: it is.
+    """
+    if verify.resolve() in {f.resolve() for f in files}:
+        raise UsageError(f"{verify}: this is the survey itself; a verification survey is one that the fit has not seen")
 
 
 @dataclass(frozen=True)

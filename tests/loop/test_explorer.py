@@ -162,6 +162,52 @@ def test_a_plugin_file_is_named_changed_and_named_again(tmp_path: Path, explorer
     assert run_recipe(tmp_path / "out" / "result.nc", tmp_path / "again").notes[0] == "reproduced bit for bit"
 
 
+CONSTANT = '''"""A constant."""
+import numpy as np
+from magtensor import error_model
+
+
+@error_model("instrument", source="diagram", typical="nT")
+def constant(x):
+    """What the offset contains."""
+    return x.offsets(np.ones(len(x.time)), "nT")
+'''
+
+
+def test_what_the_calibration_has_already_is_refused(tmp_path: Path, explorer: Explorer) -> None:
+    file = tmp_path / "constant.py"
+    file.write_text(CONSTANT)
+    assert explorer.load_plugin(file) == ["constant"]
+    explorer.adopt("offset_drift", order=1)
+    before = rms(explorer)
+    with pytest.raises(magtensor.DataError, match="constant cannot be told from the calibration as it is"):
+        explorer.adopt("constant")
+    assert [a.split()[0] for a in explorer.adopted] == ["offset_drift"] and rms(explorer) == before
+    words = explorer.left_over()["description"]  # the loop has not run: what the ranking lets pass is of use
+    passing = {str(n) for n, row in explorer.ranking().iterrows() if row["passes"]}
+    assert passing
+    of_use = words.split("significant, predicts held-out blocks and is not adopted: ")[1].split("; ")[0]
+    assert passing & set(of_use.split(", "))
+    if "of no use on held-out blocks: " in words:
+        assert not passing & set(words.split("of no use on held-out blocks: ")[1].split("; ")[0].split(", "))
+
+
+def test_messages_of_what_is_refused(tmp_path: Path, survey: Path) -> None:
+    explorer = magtensor.explore(survey, search=["temperature_offset"])
+    with pytest.raises(magtensor.DataError, match="cannot be told from the calibration"):
+        explorer.adopt("temperature_offset", lag_s=1e9)
+    explorer.adopt("temperature_offset", lag_s=100.0)
+    for settings in ({"lag_s": 50.0}, {"lag_s": 50.0, "channel": "temperature"}):
+        with pytest.raises(magtensor.UsageError, match="is adopted already; reject it or undo first"):
+            explorer.adopt("temperature_offset", **settings)
+    with pytest.raises(magtensor.UsageError, match="given by its name"):
+        explorer.adopt(None)  # type: ignore[arg-type]
+    (tmp_path / "nothing.py").write_text("x = 1\n")
+    with pytest.raises(magtensor.UsageError, match="gives no error model: mark a function"):
+        explorer.load_plugin(tmp_path / "nothing.py")
+    assert len(explorer.decisions) == 1
+
+
 def first_coefficient(explorer: Explorer) -> float:
     state = explorer._inquiry.now.state
     return float(state.theta[0][0])
@@ -184,17 +230,23 @@ def test_decisions_as_text(text: str, decision: Decision) -> None:
     assert decision_of(str(decision)) == decision
 
 
-@pytest.mark.parametrize("text", ["", "adopt", "adopt x=1", "adopt a b", "reject a x=1", "lop", "loop x", "adopt 'a"])
+@pytest.mark.parametrize(
+    "text", ["", "adopt", "adopt x=1", "adopt a b", "adopt a x=1 x=2", "reject a x=1", "lop", "loop x", "adopt 'a"]
+)
 def test_texts_that_are_no_decisions(text: str) -> None:
     with pytest.raises(magtensor.UsageError):
         decision_of(text)
 
 
 def converse(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], file: Path, *commands: str
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    file: Path,
+    *commands: str,
+    options: tuple[str, ...] = (),
 ) -> tuple[int, str]:
     monkeypatch.setattr("sys.stdin", io.StringIO("\n".join(commands) + "\n"))
-    status = status_of(["explore", str(file)])
+    status = status_of(["explore", str(file), *options])
     said = capsys.readouterr()
     assert "Traceback" not in said.out + said.err
     return status, said.out
@@ -240,6 +292,61 @@ def test_a_session_that_is_piped_in(
     # and run as the recipe that it is
     assert status_of(["run", str(session), "--output", "by_run"]) == 0
     assert json.loads((tmp_path / "by_run" / "verdict.json").read_text()) == verdict
+
+
+def test_a_session_with_another_survey_is_another_session(
+    tmp_path: Path, survey: Path, recipe: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    converse(monkeypatch, capsys, recipe, "adopt offset_drift order=1")
+    first = tmp_path / "few.session-1.yaml"
+    before = first.read_text()
+    other = tmp_path / "other.h5"
+    other.write_bytes(survey.read_bytes())
+    status, said = converse(
+        monkeypatch,
+        capsys,
+        first,
+        "reject current_field",
+        "save a b",
+        "show",
+        "save 'a",
+        options=("--input", "other.h5"),
+    )
+    assert status == 2 and first.read_text() == before
+    errors = [line for line in said.splitlines() if line.startswith("error: ")]
+    assert "write `save [FOLDER]`" in errors[0] and "write `show NAME`" in errors[1] and "cannot be read" in errors[2]
+    second = yaml.safe_load((tmp_path / "few.session-2.yaml").read_text())
+    assert Path(second["survey"]["file"]) == other
+    assert second["stages"][2]["close_loop"]["decisions"] == ["adopt offset_drift order=1", "reject current_field"]
+
+
+def test_decisions_that_no_file_holds(
+    tmp_path: Path, recipe: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fail(path: Path, text: str) -> None:
+        raise magtensor.DataError("no space left")
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("magtensor.prompt.write_text", fail)
+    status, said = converse(monkeypatch, capsys, recipe, "reject current_field")
+    assert status == 2
+    assert "no file holds the decisions: reject current_field" in said and "takes them up" not in said
+
+
+def test_a_verification_survey_is_looked_at_first(
+    tmp_path: Path, survey: Path, recipe: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    magtensor.explore(survey, search=["offset_drift"]).save(tmp_path / "out")
+    for verify, status, words in (
+        (survey, 2, "this is the survey itself"),
+        (tmp_path / "nowhere.h5", 3, "nowhere.h5"),
+        (tmp_path / "out" / "result.nc", 3, "a result of magtensor, not a survey"),
+    ):
+        assert status_of(["explore", str(recipe), "--verify", str(verify)]) == status
+        said = capsys.readouterr()
+        assert words in said.err and "`help`" not in said.out
 
 
 def test_a_bug_or_a_stop_costs_one_line(

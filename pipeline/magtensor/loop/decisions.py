@@ -66,6 +66,8 @@ def decision_of(text: str) -> Decision:
         name, equals, value = word.partition("=")
         if action == "reject" or not equals or not name:
             raise UsageError(f"{text!r}: {word} is out of place; {_form(action)}")
+        if name in settings:
+            raise UsageError(f"{text!r}: {name} is given twice")
         settings[name] = _read(value)
     return Decision(action, rest[0], settings)
 
