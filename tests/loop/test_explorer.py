@@ -186,7 +186,7 @@ def test_what_the_calibration_has_already_is_refused(tmp_path: Path, explorer: E
     words = explorer.left_over()["description"]  # the loop has not run: what the ranking lets pass is of use
     passing = {str(n) for n, row in explorer.ranking().iterrows() if row["passes"]}
     assert passing
-    of_use = words.split("significant, predicts held-out blocks and is not adopted: ")[1].split("; ")[0]
+    of_use = words.split("significant, passes the first two gates of the loop and is not adopted: ")[1].split("; ")[0]
     assert passing & set(of_use.split(", "))
     if "of no use on held-out blocks: " in words:
         assert not passing & set(words.split("of no use on held-out blocks: ")[1].split("; ")[0].split(", "))

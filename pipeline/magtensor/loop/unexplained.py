@@ -2,7 +2,7 @@
 
 Independent sensors have independent noise, white or slow. So what is left is called unexplained only where noise
 cannot make it: a waveform that the sensors share, a line in the spectrum, or an error model that is significant and
-yet does not predict held-out data.
+was not adopted.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
     if turning > 0:
         words.append(f"{turning:.3g} nT rms of it can be predicted from the direction of the field and how it turns")
     if open_ := [c.model.name for c in suspects if c.passes]:
-        words.append(f"significant, predicts held-out blocks and is not adopted: {', '.join(open_)}")
+        words.append(f"significant, passes the first two gates of the loop and is not adopted: {', '.join(open_)}")
     if useless := [c.model.name for c in suspects if not c.passes]:
         words.append(f"significant but of no use on held-out blocks: {', '.join(useless)}")
     if words:
