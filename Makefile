@@ -23,7 +23,7 @@ lint: $(STAMP)
 	$(BIN)/lint-imports
 
 test: lint
-	$(BIN)/pytest -n auto
+	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n auto  # as many workers as cores, one thread each
 
 bench: $(STAMP)
 	$(BIN)/python benchmarks/pipeline.py
