@@ -33,10 +33,10 @@ def worker(recipe: str, survey: str) -> None:
     """Run one recipe and print its stages' CPU seconds and the process's peak memory as JSON."""
     import time
 
+    from magtensor.preparing import empty_survey
     from magtensor.recipe.plan import plan
     from magtensor.recipe.source import parse_yaml
     from magtensor.runner import run_stage
-    from magtensor.session import empty_survey
 
     planned = plan(parse_yaml(recipe, "benchmark"), survey=Path(survey))
     state = empty_survey(planned)

@@ -30,11 +30,12 @@ from magtensor.errors import MagtensorError
 from magtensor.loop.model import Fitting, Record
 from magtensor.loop.record import record_of
 from magtensor.loop.search import Search, search
+from magtensor.preparing import empty_survey
 from magtensor.recipe.plan import plan
 from magtensor.recipe.source import parse_yaml
 from magtensor.registry import Registry
 from magtensor.runner import run
-from magtensor.session import empty_survey, run_recipe
+from magtensor.session import run_recipe
 from magtensor.simulate import simulate, write
 
 RECIPE = Path(__file__).parents[1] / "recipes" / "closed_loop.yaml"

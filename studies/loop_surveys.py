@@ -9,10 +9,10 @@ from typing import Any
 
 from magtensor.loop.model import Record
 from magtensor.loop.record import record_of
+from magtensor.preparing import empty_survey
 from magtensor.recipe.plan import plan
 from magtensor.recipe.source import parse_yaml
 from magtensor.runner import run
-from magtensor.session import empty_survey
 from magtensor.simulate import Simulated, write
 
 BASE: dict[str, Any] = {

@@ -19,9 +19,9 @@ from pathlib import Path
 import numpy as np
 
 from magtensor.loop.record import channels_of
+from magtensor.preparing import empty_survey
 from magtensor.recipe.plan import read_plan
 from magtensor.runner import run
-from magtensor.session import empty_survey
 
 RECIPES = Path(__file__).parents[1] / "recipes" / "measured"
 BLOCKS = 10

@@ -97,9 +97,9 @@ def apply(
     save_calibration: Path | None,
 ) -> None:
     """Apply a stored CALIBRATION to another SURVEY."""
-    from magtensor import session
+    from magtensor import applying
 
-    applied = session.apply(
+    applied = applying.apply(
         calibration, survey, output, memory_GiB=memory_GiB, refine_rotation=refine_rotation,
         save_calibration=save_calibration,
     )  # fmt: skip

@@ -11,11 +11,13 @@ from typing import TYPE_CHECKING, Any
 
 from magtensor import provenance, result
 from magtensor.accuracy import figure
+from magtensor.applying import apply_and_refine, fit_in_words
 from magtensor.errors import UsageError
-from magtensor.provenance import Provenance
+from magtensor.preparing import empty_survey
+from magtensor.provenance import Provenance, plan_again
 from magtensor.recipe.plan import Plan, plan
 from magtensor.recipe.source import Document, load_yaml
-from magtensor.session import Computed, Finished, again, apply_and_refine, compute, empty_survey, fit_in_words
+from magtensor.session import Computed, Finished, compute
 from magtensor.survey.in_memory import Held, SurveyLike, given_survey
 from magtensor.survey.model import Survey
 from magtensor.verdict import sentence, survey_block
@@ -99,7 +101,7 @@ class Calibration:
             DataError, UsageError: it is no such file, or needs a plugin that is not installed.
         """
         stored, made_by = result.open_result(Path(path)), provenance.read(Path(path))
-        return cls(stored, again(Path(path), made_by), made_by)
+        return cls(stored, plan_again(Path(path), made_by), made_by)
 
     @property
     def dataset(self) -> xr.Dataset:

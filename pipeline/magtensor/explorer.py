@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import yaml
 
 from magtensor.accuracy import figure
+from magtensor.applying import verification
 from magtensor.calibration.nominal import Nominal
 from magtensor.closed_loop import STAGE, loop_document
 from magtensor.errors import MagtensorError, UsageError
@@ -20,10 +21,11 @@ from magtensor.loop.model import Fitting
 from magtensor.loop.near_nominal import begun
 from magtensor.loop.outcome import judgement
 from magtensor.loop.unexplained import unexplained
+from magtensor.preparing import empty_survey, load_as
 from magtensor.recipe.plan import Plan, plan
 from magtensor.recipe.source import Document
 from magtensor.runner import run_stage
-from magtensor.session import Computed, Finished, empty_survey, load_as, require_unseen, verification
+from magtensor.session import Computed, Finished, require_unseen
 from magtensor.survey.in_memory import Held, SurveyLike, given_survey
 from magtensor.verdict import verdict
 

@@ -23,15 +23,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtensor import provenance, result
+from magtensor.applying import Applied, apply_to, fit_in_words, verification
 from magtensor.atomic import atomic_path, atomic_set
 from magtensor.calibrated import contrasts, left_open
 from magtensor.calibration.recording import even_blocks
 from magtensor.errors import DataError, UsageError
+from magtensor.preparing import load_as, preparing_stages
 from magtensor.provenance import Provenance
 from magtensor.qc import told
 from magtensor.recipe.plan import Plan
 from magtensor.runner import StageRecord, run_stage
-from magtensor.session import Applied, Finished, apply_to, fit_in_words, load_as, preparing_stages, verification
+from magtensor.session import Finished
 from magtensor.survey.flags import Flag, flag_ranges
 from magtensor.survey.model import Survey, without_variables
 from magtensor.survey.source import Source
@@ -153,7 +155,7 @@ def run_long(
 def apply_long(
     stored: Survey, planned: Plan, survey: Path, target: Path, made_by: Provenance, memory_GiB: float
 ) -> Applied:
-    """Apply a calibration to a survey longer than the memory; as `session.apply`."""
+    """Apply a calibration to a survey longer than the memory; as `applying.apply`."""
     _require_no_memory(stored)
     blocks: list[tuple[int, dict[str, Any] | None]] = []
     flags: list[Flag] = []

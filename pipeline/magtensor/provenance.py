@@ -155,6 +155,23 @@ def read(path: Path) -> Provenance:
         raise UsageError(f"{path}: its /{GROUP} is damaged: {error}") from error
 
 
+def plan_again(
+    path: Path,
+    before: Provenance,
+    *,
+    overrides: Sequence[str] = (),
+    plugin_folders: Sequence[Path] = (),
+    survey: Path | None = None,
+) -> Plan:
+    """The plan of a result, from its provenance."""
+    from magtensor.recipe.plan import plan
+    from magtensor.recipe.source import Document
+
+    folder = Path(before.notes.get("folder", "."))
+    document = Document(before.recipe, f"{path}:/provenance", {}, folder)
+    return plan(document, overrides=overrides, plugin_folders=plugin_folders, survey=survey)
+
+
 def check_inputs(provenance: Provenance) -> None:
     """The inputs are still what they were.
 

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from magtensor.preparing import empty_survey
 from magtensor.recipe.plan import Plan, read_plan
 from magtensor.recipe.source import load_yaml
 from magtensor.runner import run
-from magtensor.session import empty_survey
 from magtensor.simulate import Simulated, simulate, write
 from magtensor.survey.model import Survey
 from magtensor.tensors import stored_assembly

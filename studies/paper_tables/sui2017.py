@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from magtensor.session import apply_to
+from magtensor.applying import apply_to
 from magtensor.simulate import Simulated
 from magtensor.survey.model import Survey
 from magtensor.tensor.elements import five, full, rotation_of_five

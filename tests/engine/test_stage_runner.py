@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from magtensor.errors import DataError, UsageError
+from magtensor.preparing import empty_survey
 from magtensor.runner import run
-from magtensor.session import empty_survey
 
 PLUGIN = '''
 from magtensor.survey.flags import Flag

@@ -10,14 +10,16 @@ import pytest
 import xarray as xr
 from joint_cases import Array, Drawn, directions, drawn
 
+from magtensor.applying import apply_to
 from magtensor.calibration.joint import calibrated, fit_joint, nearest_frame
 from magtensor.cli import status_of
 from magtensor.components import component_of
 from magtensor.effect_errors import COVARIANCE, WithCoefficients, with_coefficients
 from magtensor.loop.model import Adopted, Fitting, State, joint_state
 from magtensor.loop.record import record_of
+from magtensor.preparing import empty_survey
 from magtensor.recipe.plan import read_plan
-from magtensor.session import apply_to, compute, empty_survey
+from magtensor.session import compute
 from magtensor.survey.model import Survey, without_variables
 from magtensor_effects import reference, temperature
 

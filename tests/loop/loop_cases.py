@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from magtensor.loop.model import Fitting, Record, State, joint_state
 from magtensor.loop.record import record_of
+from magtensor.preparing import empty_survey, load_as
 from magtensor.recipe.plan import read_plan
 from magtensor.runner import run
-from magtensor.session import empty_survey, load_as
 from magtensor.simulate import simulate, write
 from magtensor.verdict import verdict
 

@@ -15,10 +15,11 @@ from loop_cases import RECIPE, scenario, survey_file
 
 import magtensor
 from magtensor import provenance
+from magtensor.applying import apply
 from magtensor.closed_loop import RECIPE as PACKAGED
 from magtensor.closed_loop import ClosedLoop
 from magtensor.result import FILES, open_result
-from magtensor.session import apply, run_recipe
+from magtensor.session import run_recipe
 from magtensor.survey.canonical import read_canonical
 from magtensor.survey.in_memory import Held, given_survey
 from magtensor.survey.model import Survey

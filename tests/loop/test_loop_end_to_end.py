@@ -13,9 +13,10 @@ import yaml
 from loop_cases import RECIPE, adopted_names, scenario, survey_file, suspects, verdict_of
 
 from magtensor.errors import DataError
+from magtensor.preparing import empty_survey
 from magtensor.recipe.plan import read_plan
 from magtensor.runner import run
-from magtensor.session import empty_survey, run_recipe
+from magtensor.session import run_recipe
 
 POSTURES = Path(__file__).parents[2] / "recipes" / "scenarios" / "postures.yaml"
 NOISE_NT = 0.15

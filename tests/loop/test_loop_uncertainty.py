@@ -9,9 +9,9 @@ import numpy as np
 from loop_cases import scenario, survey_file
 
 import magtensor
+from magtensor.applying import apply_to
 from magtensor.effect_errors import COVARIANCE
 from magtensor.result import open_result
-from magtensor.session import apply_to
 from magtensor.survey.model import without_variables
 
 

@@ -10,9 +10,9 @@ import pytest
 
 from magtensor.calibrated import left_open
 from magtensor.errors import NotEnoughData
+from magtensor.preparing import empty_survey
 from magtensor.recipe.plan import Plan, read_plan
 from magtensor.runner import run
-from magtensor.session import empty_survey
 from magtensor.survey.model import Survey
 
 RECIPES = Path(__file__).parents[2] / "recipes" / "measured"

@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 
 from magtensor import DataError
+from magtensor.applying import apply
+from magtensor.preparing import empty_survey
 from magtensor.recipe.plan import read_plan
 from magtensor.recipe.source import load_yaml
 from magtensor.runner import run
-from magtensor.session import apply, empty_survey, run_recipe
+from magtensor.session import run_recipe
 from magtensor.simulate import simulate, write
 from magtensor.simulate.gradiometers import GradiometersSpec, build_gradiometers
 from magtensor.survey.model import Survey

@@ -9,10 +9,10 @@ import pytest
 import xarray as xr
 
 from magtensor.cli import status_of
+from magtensor.preparing import empty_survey
 from magtensor.recipe.plan import read_plan
 from magtensor.recipe.source import load_yaml
 from magtensor.runner import run
-from magtensor.session import empty_survey
 from magtensor.simulate import Simulated, simulate, write
 from magtensor.tensor.elements import five, full, rotation_of_five
 from magtensor.tensor.refinement import nearest_in_gauge
