@@ -69,7 +69,7 @@ def apply(
     stored = result.open_result(calibration)
     made_by = provenance.read(calibration)
     planned = plan_again(calibration, made_by)
-    inputs = [provenance.file_facts(survey), provenance.file_facts(calibration)]
+    inputs = [provenance.facts(survey), provenance.facts(calibration)]
     applied = Provenance(
         made_by.recipe, inputs, provenance.versions(), made_by.plugins, made_by.stages,
         notes={**made_by.notes, "applied": "recipe and stages are the calibration's, the inputs are this file's"},

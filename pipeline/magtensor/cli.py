@@ -23,6 +23,10 @@ plugins_option = click.option(
     "--plugins", "plugin_folders", type=click.Path(path_type=Path), multiple=True, metavar="FOLDER",
     help="A folder of single-file plugins (or one such file); may be given several times.",
 )  # fmt: skip
+verify_option = click.option(
+    "--verify", type=FILE,
+    help="A second survey in a uniform field; its error goes into the verdict. In place of the recipe's own.",
+)  # fmt: skip
 set_option = click.option(
     "--set", "overrides", multiple=True, metavar="PATH=VALUE",
     help="Change one value of the recipe, e.g. stages.align.to=S2; may be given several times.",
@@ -38,7 +42,7 @@ def cli() -> None:
 @cli.command()
 @click.argument("recipe", type=FILE)
 @click.option("--input", "survey", type=FILE, help="The survey, in place of the recipe's own.")
-@click.option("--verify", type=FILE, help="A second survey in a uniform field; its error goes into the verdict.")
+@verify_option
 @click.option("--output", type=FOLDER, help="Folder for the results; default: the recipe's name with .result.")
 @memory_option
 @set_option
@@ -199,7 +203,7 @@ def plugins(as_json: bool, words: tuple[str, ...], plugin_folders: tuple[Path, .
 @cli.command()
 @click.argument("file", type=FILE, metavar="SURVEY")
 @click.option("--input", "survey", type=FILE, help="The survey, in place of a recipe's own.")
-@click.option("--verify", type=FILE, help="A second survey in a uniform field; its error goes into the verdict.")
+@verify_option
 @click.option("--output", type=FOLDER, help="Folder for the results; default: the survey's name with .explored.")
 @plugins_option
 def explore(

@@ -12,12 +12,11 @@ from typing import TYPE_CHECKING, Any
 from magtensor import provenance, result
 from magtensor.accuracy import figure
 from magtensor.applying import apply_and_refine, fit_in_words
-from magtensor.errors import UsageError
 from magtensor.preparing import empty_survey
 from magtensor.provenance import Provenance, plan_again
 from magtensor.recipe.plan import Plan, plan
 from magtensor.recipe.source import Document, load_yaml
-from magtensor.session import Computed, Finished, compute
+from magtensor.session import Computed, Finished, compute, require_verifying
 from magtensor.survey.in_memory import Held, SurveyLike, given_survey
 from magtensor.survey.model import Survey
 from magtensor.verdict import sentence, survey_block
@@ -54,18 +53,21 @@ def close_loop(
         DataError, NotEnoughData: the survey is wrong, or not enough to calibrate.
     """
     given = given_survey(survey)
-    planned = planned_loop(given, options, plugins)
     verified = None if verify is None else given_survey(verify)
-    if isinstance(given, Path) and isinstance(verified, Path) and given.resolve() == verified.resolve():
-        raise UsageError(f"{verified}: this is the survey itself; verify with one that the fit has not seen")
+    planned = planned_loop(given, options, plugins, verified)
+    if verified is not None:
+        require_verifying(planned, verified, planned.source().files() if isinstance(given, Path) else ())
     source = planned.source() if isinstance(given, Path) else given
-    return ClosedLoop(compute(planned, empty_survey(source), verify=verified, progress=progress))
+    held = verified if isinstance(verified, Held) else None
+    return ClosedLoop(compute(planned, empty_survey(source), verify=held, progress=progress))
 
 
-def planned_loop(given: Path | Held, options: dict[str, Any], plugins: Sequence[str | Path] = ()) -> Plan:
-    """The recipe that closes the loop, with options of its stage, on a survey."""
-    folders = [Path(p) for p in plugins]
-    return plan(loop_document(options), plugin_folders=folders, survey=given if isinstance(given, Path) else None)
+def planned_loop(
+    given: Path | Held, options: dict[str, Any], plugins: Sequence[str | Path] = (), verify: Path | Held | None = None
+) -> Plan:
+    """The recipe that closes the loop, with options of its stage, on a survey, verified by another."""
+    survey, verify = (None if isinstance(one, Held) else one for one in (given, verify))
+    return plan(loop_document(options), plugin_folders=[Path(p) for p in plugins], survey=survey, verify=verify)
 
 
 def loop_document(options: dict[str, Any]) -> Document:

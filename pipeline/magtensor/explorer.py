@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 import yaml
 
 from magtensor.accuracy import figure
-from magtensor.applying import verification
 from magtensor.calibration.nominal import Nominal
 from magtensor.closed_loop import STAGE, loop_document
 from magtensor.errors import MagtensorError, UsageError
@@ -21,13 +20,12 @@ from magtensor.loop.model import Fitting
 from magtensor.loop.near_nominal import begun
 from magtensor.loop.outcome import judgement
 from magtensor.loop.unexplained import unexplained
-from magtensor.preparing import empty_survey, load_as
+from magtensor.preparing import empty_survey
 from magtensor.recipe.plan import Plan, plan
 from magtensor.recipe.source import Document
-from magtensor.runner import run_stage
-from magtensor.session import Computed, Finished, require_unseen
+from magtensor.runner import RunResult, run_stage
+from magtensor.session import Computed, Finished, judged, require_verifying
 from magtensor.survey.in_memory import Held, SurveyLike, given_survey
-from magtensor.verdict import verdict
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -58,7 +56,7 @@ class Explorer:
     Args:
         document: a recipe with the stage `close_loop`; decisions that it holds are taken first.
         given: the survey; the recipe's own if None.
-        verify: a second survey in a uniform field, for the verdict.
+        verify: a second survey in a uniform field, for the verdict; the recipe's own if None.
         plugins: folders of single-file plugins, or such files.
     """
 
@@ -77,10 +75,9 @@ class Explorer:
         self._place = next((i for i, s in enumerate(self._planned.stages) if s.name == STAGE), -1)
         if self._place < 0:
             raise UsageError(f"{document.file}: the recipe has no stage {STAGE}, there is nothing to explore")
+        self._verify = self._verify or self._planned.verify
         if self._verify is not None:
-            if isinstance(self._verify, Path):
-                require_unseen(self._verify, self.sources)
-            load_as(self._planned, self._verify)  # refused now if it cannot be read, not at the end
+            require_verifying(self._planned, self._verify, self.sources)
         survey = empty_survey(given if isinstance(given, Held) else self._planned)
         records = []
         for stage in self._planned.stages[: self._place]:
@@ -257,8 +254,7 @@ class Explorer:
             used = self._used(function) if number == 0 else None
             survey, record = run_stage(stage, survey, used)
             records.append(record)
-        checked = None if self._verify is None else verification(survey, self._verify, planned)
-        return Computed(planned, survey, tuple(records), verdict(survey, verify=checked))
+        return judged(planned, RunResult(survey, tuple(records)), self._verify)
 
     def save(self, directory: str | Path) -> Finished:
         """Write result.nc, calibration.nc, verdict.json and report.html into a folder, all or none.
@@ -303,13 +299,18 @@ class Explorer:
         """The files that the survey is read from."""
         return [] if isinstance(self._given, Held) else self._planned.source().files()
 
+    @property
+    def inputs(self) -> list[Path]:
+        """These, and the file of the verification survey."""
+        return [*self.sources, *([self._verify] if isinstance(self._verify, Path) else [])]
+
     def _plan(self, folders: Sequence[Path], decisions: Sequence[Decision] | None) -> Plan:
         document = self._document
         if decisions is not None:
             named = [m.name for m in self._inquiry.models]
             document = with_decisions(document, [str(d) for d in decisions], named)
-        survey = self._given if isinstance(self._given, Path) else None
-        return plan(document, plugin_folders=folders, survey=survey)
+        survey, verify = (None if isinstance(one, Held) else one for one in (self._given, self._verify))
+        return plan(document, plugin_folders=folders, survey=survey, verify=verify)
 
     def _inquired(self, planned: Plan) -> Inquiry:
         options: Mapping[str, Any] = planned.stages[self._place].options

@@ -101,7 +101,6 @@ def run_long(
     output: Path,
     memory_GiB: float,
     *,
-    verify: Path | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> Finished:
     """Run a plan on a survey longer than the memory, and write the files of the contract.
@@ -137,13 +136,14 @@ def run_long(
                 found = without_variables(found, *({"diurnal"} & set(found)))
                 yield result.only(result.result_tree(found), "calibrated", "residual", "detrended")
 
-        made_by = provenance.collect(planned, records, source.files())
+        made_by = provenance.collect(planned, records, source.files(), planned.verify)
         made_by = replace(made_by, notes={**made_by.notes, "memory_GiB": f"{memory_GiB:g}"})
         with atomic_set(output, last=result.RESULT) as folder:
             whole = result.only(result.result_tree(survey), "calibration", "qc")
             made_by = _appended(folder / result.RESULT, whole, parts(), made_by)
             result.save(result.only(whole, "calibration"), made_by, folder / result.CALIBRATION)
-            outcome = verdict(survey, verify=verification(survey, verify, planned) if verify else None)
+            checked = None if planned.verify is None else verification(survey, planned.verify, planned)
+            outcome = verdict(survey, verify=checked)
             outcome["error"]["fit"] = combined(blocks)
             result.write_verdict(folder, outcome)
             say("report")

@@ -54,7 +54,7 @@ def converse(
         file: a survey in the canonical layout; or a recipe (.yaml) with the stage `close_loop`, such as the file
             that an earlier session left.
         survey: in place of the recipe's own.
-        verify: a second survey, for the verdict.
+        verify: a second survey, for the verdict; in place of the recipe's own.
         output: folder for the result; default: the file's name with `.explored`.
         plugins: folders of single-file plugins, or such files.
 
@@ -73,8 +73,8 @@ def converse(
     require_writable(directory)
     console = Console(highlight=False, soft_wrap=True, width=None if sys.stdout.isatty() else 160)
     explorer = Explorer(document, given, verify=verify, plugins=plugins)
-    refuse_overwriting([directory / "result.nc"], [*explorer.sources, *([verify] if verify else [])])
-    session = Session(explorer, console, directory, _journal(file, directory, survey))
+    refuse_overwriting([directory / "result.nc"], explorer.inputs)
+    session = Session(explorer, console, directory, _journal(file, directory, survey, verify))
     console.print(f"{file}: `help` lists the commands")
     session.status()
     session.run(_typed() if sys.stdin.isatty() else _piped(console))
@@ -220,7 +220,7 @@ class Session:
         if len(words) > 1:
             raise UsageError("write `save [FOLDER]`; a name with blanks needs quotes")
         directory = Path(words[0]) if words else self.directory
-        refuse_overwriting([directory / "result.nc"], self.explorer.sources)
+        refuse_overwriting([directory / "result.nc"], self.explorer.inputs)
         require_writable(directory)
         finished = self.explorer.save(directory)
         self.saved = self.explorer.decisions
@@ -268,16 +268,16 @@ class Session:
         return table
 
 
-def _journal(file: Path, directory: Path, survey: Path | None) -> Path:
-    """A session goes on in its own file, unless with another survey; another recipe's stays beside it, so that
-    relative names still hold."""
+def _journal(file: Path, directory: Path, survey: Path | None, verify: Path | None) -> Path:
+    """A session goes on in its own file, unless with another survey or verified by another; another recipe's stays
+    beside it, so that relative names still hold."""
     if file.suffix.lower() not in RECIPES:
         folder, stem = directory, file.stem
-    elif survey is None and any(
-        isinstance(s, dict) and (s.get(STAGE) or {}).get("decisions") for s in load_yaml(file).value["stages"]
-    ):
-        return file
     else:
+        recipe = load_yaml(file).value
+        decided = any(isinstance(s, dict) and (s.get(STAGE) or {}).get("decisions") for s in recipe["stages"])
+        if decided and survey is None and (verify is None or str(verify.resolve()) == recipe.get("verify")):
+            return file
         folder, stem = file.parent, re.sub(r"\.session-\d+$", "", file.stem)
     number = 1
     while (folder / f"{stem}.session-{number}.yaml").exists():

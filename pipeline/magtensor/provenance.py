@@ -19,9 +19,11 @@ if TYPE_CHECKING:
 
     from magtensor.recipe.plan import Plan
     from magtensor.runner import StageRecord
+    from magtensor.survey.in_memory import Held
 
 LIBRARIES = ("numpy", "scipy", "h5py", "h5netcdf", "xarray", "pydantic", "pluggy", "pyyaml")
 GROUP = "provenance"
+VERIFICATION = "verification"  # the role of an input that the fit did not see
 HASHED_AT_ONCE = 65536  # rows
 
 
@@ -31,7 +33,7 @@ class Provenance:
 
     Attributes:
         recipe: the resolved recipe, every default written out.
-        inputs: path, SHA-256 and size of each file read.
+        inputs: path, SHA-256 and size of each file read; `role` of one that only verifies.
         versions: of the package, Python and the libraries.
         plugins: distribution and version, or file and SHA-256, of each plugin that took part.
         stages: what each stage did, in order.
@@ -70,8 +72,10 @@ class Provenance:
         return cls(**parts, content_sha256=str(attributes["content_sha256"]))
 
 
-def collect(plan: Plan, records: Iterable[StageRecord], inputs: Iterable[Path]) -> Provenance:
-    """The provenance of a run that succeeded."""
+def collect(
+    plan: Plan, records: Iterable[StageRecord], inputs: Iterable[Path | Held], verify: Path | Held | None = None
+) -> Provenance:
+    """The provenance of a run that succeeded, verified with another survey or not."""
     used = {id(c) for stage in plan.stages for c in stage.uses}
     readers = {key for key in plan.registry.components if key[0] == "reader"}
     plugins = {
@@ -81,7 +85,7 @@ def collect(plan: Plan, records: Iterable[StageRecord], inputs: Iterable[Path]) 
     }
     return Provenance(
         recipe=plan.resolved(),
-        inputs=[file_facts(p) for p in inputs],
+        inputs=[*(facts(i) for i in inputs), *([facts(verify) | {"role": VERIFICATION}] if verify else [])],
         versions=versions(),
         plugins=list(plugins.values()),
         stages=[r.as_dict() for r in records],
@@ -97,10 +101,11 @@ def versions() -> dict[str, str]:
     return found
 
 
-def file_facts(path: Path) -> dict[str, Any]:
-    """Path, SHA-256 and size of a file."""
-    path = Path(path)
-    return {"path": str(path.resolve()), "sha256": sha256(path), "bytes": path.stat().st_size}
+def facts(given: Path | Held) -> dict[str, Any]:
+    """Path, SHA-256 and size of a file, or of a survey in memory."""
+    if not isinstance(given, Path):
+        return given.facts()
+    return {"path": str(given.resolve()), "sha256": sha256(given), "bytes": given.stat().st_size}
 
 
 def sha256(path: Path) -> str:
@@ -162,6 +167,7 @@ def plan_again(
     overrides: Sequence[str] = (),
     plugin_folders: Sequence[Path] = (),
     survey: Path | None = None,
+    verify: Path | None = None,
 ) -> Plan:
     """The plan of a result, from its provenance."""
     from magtensor.recipe.plan import plan
@@ -169,34 +175,42 @@ def plan_again(
 
     folder = Path(before.notes.get("folder", "."))
     document = Document(before.recipe, f"{path}:/provenance", {}, folder)
-    return plan(document, overrides=overrides, plugin_folders=plugin_folders, survey=survey)
+    return plan(document, overrides=overrides, plugin_folders=plugin_folders, survey=survey, verify=verify)
 
 
-def check_inputs(provenance: Provenance) -> None:
-    """The inputs are still what they were.
+def check_inputs(provenance: Provenance, *, survey: bool, verification: bool) -> None:
+    """The inputs that are to be read again, the survey's or the one that verifies or both, are still what they were.
 
     Raises:
         DataError: a file is gone or has changed.
     """
     for entry in provenance.inputs:
+        verifies = entry.get("role") == VERIFICATION
+        what, option = ("the verification survey", "--verify") if verifies else ("an input", "--input")
+        if not (verification if verifies else survey):
+            continue
         path = Path(entry["path"])
         if not path.is_file():
-            raise DataError("an input of this result is no longer there", where=str(path), hint="name it with --input")
+            raise DataError(f"{what} of this result is no longer there", where=str(path), hint=f"name it with {option}")
         if sha256(path) != entry["sha256"]:
             raise DataError(
-                "this input has changed since the result was made",
+                f"this {what.split(' ', 1)[1]} has changed since the result was made",
                 where=str(path),
-                hint=f"its SHA-256 was {entry['sha256']}; name the original with --input",
+                hint=f"its SHA-256 was {entry['sha256']}; name the original with {option}",
             )
 
 
 def differences(then: Provenance, now: Provenance) -> list[str]:
-    """In words, what is not as it was: versions of the package, the libraries and the plugins."""
+    """In words, what is not as it was: the verification survey, versions of the package, libraries and plugins."""
     lines = [
         f"{name} was {old}, is {now.versions.get(name, 'not there')}"
         for name, old in then.versions.items()
         if now.versions.get(name) != old
     ]
+    verified = [next((i for i in p.inputs if i.get("role") == VERIFICATION), None) for p in (then, now)]
+    if len({v and v["sha256"] for v in verified}) > 1:
+        was, is_ = (v["path"] if v else "none" for v in verified)
+        lines.append(f"the verification survey was {was}, is {is_}")
     current = {_plugin_label(p): p for p in now.plugins}
     for plugin in then.plugins:
         label = _plugin_label(plugin)

@@ -5,25 +5,22 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from magtensor import provenance, result
 from magtensor.applying import verification
 from magtensor.atomic import refuse_overwriting, require_writable
 from magtensor.calibrated import left_open
 from magtensor.errors import UsageError
-from magtensor.preparing import empty_survey
+from magtensor.preparing import empty_survey, load_as
 from magtensor.provenance import Provenance
 from magtensor.qc import told
 from magtensor.recipe.plan import Plan, read_plan
-from magtensor.runner import StageRecord, run
+from magtensor.runner import RunResult, StageRecord, run
 from magtensor.survey.in_memory import Held
 from magtensor.survey.model import Survey
 from magtensor.survey.source import Source
 from magtensor.verdict import sentence, verdict
-
-if TYPE_CHECKING:
-    pass
 
 HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
 
@@ -66,7 +63,8 @@ def run_recipe(
         recipe: a YAML recipe, or a `result.nc`.
         output: the folder to write into.
         survey: takes the place of the recipe's own survey.
-        verify: a second survey in a uniform field with a total field; its error goes into the verdict.
+        verify: a second survey in a uniform field with a total field; its error goes into the verdict. Takes the
+            place of the one that the recipe names, or that the result was verified with.
         overrides: `PATH=VALUE` texts.
         plugin_folders: folders of single-file plugins.
         progress: called with each stage's name.
@@ -78,15 +76,15 @@ def run_recipe(
     before: Provenance | None = None
     if is_hdf5(recipe):
         before = provenance.read(recipe)
-        if survey is None:
-            provenance.check_inputs(before)
         planned = provenance.plan_again(
-            recipe, before, overrides=overrides, plugin_folders=plugin_folders, survey=survey
+            recipe, before, overrides=overrides, plugin_folders=plugin_folders, survey=survey, verify=verify
         )
+        same = planned.resolved().get("verify") == before.recipe.get("verify")
+        provenance.check_inputs(before, survey=survey is None, verification=verify is None and same)
         memory_GiB = memory_GiB or float(before.notes.get("memory_GiB", 0)) or None
     else:
-        planned = read_plan(recipe, overrides=overrides, plugin_folders=plugin_folders, survey=survey)
-    finished = run_plan(planned, output, verify=verify, progress=progress, memory_GiB=memory_GiB)
+        planned = read_plan(recipe, overrides=overrides, plugin_folders=plugin_folders, survey=survey, verify=verify)
+    finished = run_plan(planned, output, progress=progress, memory_GiB=memory_GiB)
     if before is not None and not overrides and survey is None:
         return replace(finished, notes=(*compare(before, finished.made_by), *finished.notes))
     return finished
@@ -96,33 +94,35 @@ def run_plan(
     planned: Plan,
     output: Path,
     *,
-    verify: Path | None = None,
     progress: Callable[[str], None] | None = None,
     memory_GiB: float | None = None,
 ) -> Finished:
     """Run a plan and write the files of the contract; as `run_recipe`."""
     require_writable(output)
     files = planned.source().files()
+    verify = planned.verify
     refuse_overwriting([output / name for name in result.FILES], [*files, *([verify] if verify else [])])
     if verify is not None:
-        require_unseen(verify, files)
+        require_verifying(planned, verify, files)
     if progress is not None:
         progress("start")
     if memory_GiB is not None:
         from magtensor.long_survey import run_long
 
-        return run_long(planned, output, memory_GiB, verify=verify, progress=progress)
-    return compute(planned, empty_survey(planned), verify=verify, progress=progress).write(output)
+        return run_long(planned, output, memory_GiB, progress=progress)
+    return compute(planned, empty_survey(planned), progress=progress).write(output)
 
 
-def require_unseen(verify: Path, files: Sequence[Path]) -> None:
-    """See that a verification survey is none of the files that the survey is read from.
+def require_verifying(planned: Plan, verify: Path | Held, files: Sequence[Path]) -> None:
+    """See that a verification survey can be read, and is none of the survey's files: now and not after the fit.
 
     Raises:
-        UsageError: it is.
+        UsageError: it is the survey itself.
+        DataError: it cannot be read and prepared as the recipe does.
     """
-    if verify.resolve() in {f.resolve() for f in files}:
+    if isinstance(verify, Path) and verify.resolve() in {f.resolve() for f in files}:
         raise UsageError(f"{verify}: this is the survey itself; a verification survey is one that the fit has not seen")
+    load_as(planned, verify)
 
 
 @dataclass(frozen=True)
@@ -134,19 +134,20 @@ class Computed:
         survey: after the last stage.
         records: what each stage did.
         outcome: the content of `verdict.json`.
+        verify: the verification survey.
     """
 
     planned: Plan
     survey: Survey
     records: tuple[StageRecord, ...]
     outcome: dict[str, Any]
+    verify: Path | Held | None = None
 
     def provenance(self) -> Provenance:
         """What made it."""
-        if isinstance(self.survey.source, Held):
-            made_by = provenance.collect(self.planned, self.records, ())
-            return replace(made_by, inputs=[self.survey.source.facts()])
-        return provenance.collect(self.planned, self.records, self.planned.source().files())
+        source = self.survey.source
+        inputs = [source] if isinstance(source, Held) else self.planned.source().files()
+        return provenance.collect(self.planned, self.records, inputs, self.verify)
 
     def write(self, output: Path) -> Finished:
         """Write the files of the contract."""
@@ -163,13 +164,20 @@ def compute(
     planned: Plan,
     survey: Survey,
     *,
-    verify: Path | Held | None = None,
+    verify: Held | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> Computed:
-    """Run a plan on a survey (one that only knows its source), write nothing; else as `run_plan`."""
-    done = run(planned, survey, progress=progress)
-    outcome = verdict(done.survey, verify=verification(done.survey, verify, planned) if verify else None)
-    return Computed(planned, done.survey, done.records, outcome)
+    """Run a plan on a survey (one that only knows its source), write nothing; else as `run_plan`.
+
+    `verify` is a verification survey that is in memory; a file's path is in the plan.
+    """
+    return judged(planned, run(planned, survey, progress=progress), verify or planned.verify)
+
+
+def judged(planned: Plan, done: RunResult, verify: Path | Held | None) -> Computed:
+    """What a plan's stages made, with its verdict."""
+    checked = None if verify is None else verification(done.survey, verify, planned)
+    return Computed(planned, done.survey, done.records, verdict(done.survey, verify=checked), verify)
 
 
 def compare(before: Provenance, now: Provenance) -> tuple[str, ...]:

@@ -16,6 +16,7 @@ import magtensor
 from magtensor.cli import status_of
 from magtensor.explorer import Explorer
 from magtensor.loop.decisions import Decision, decision_of
+from magtensor.recipe.source import load_yaml
 from magtensor.result import FILES
 from magtensor.session import run_recipe
 
@@ -371,3 +372,25 @@ def test_what_cannot_be_explored(tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert status_of(["explore", str(tmp_path / "nowhere.h5")]) == 3
     assert status_of(["explore", str(tmp_path / "other.yaml")]) == 2
     assert "no stage close_loop" in capsys.readouterr().err
+
+
+def test_a_session_holds_its_verification_survey(
+    tmp_path: Path, survey: Path, recipe: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("verify.h5", "other.h5"):
+        (tmp_path / name).write_bytes(survey.read_bytes())
+    options = ("--verify", "verify.h5")
+    converse(monkeypatch, capsys, recipe, "reject current_field", options=options)
+    first = tmp_path / "few.session-1.yaml"
+    written = first.read_text()
+    assert yaml.safe_load(written)["verify"] == str(tmp_path / "verify.h5")
+    session = Explorer(load_yaml(first), None)
+    assert set(session.verdict()["error"]["verify"]) == {"before", "after"}
+    assert session.inputs == [survey, tmp_path / "verify.h5"]
+    converse(monkeypatch, capsys, first, "reject offset_drift", options=options)
+    assert yaml.safe_load(first.read_text())["verify"] == str(tmp_path / "verify.h5")
+    assert not (tmp_path / "few.session-2.yaml").exists()
+    converse(monkeypatch, capsys, first, "status", options=("--verify", "other.h5"))
+    assert yaml.safe_load((tmp_path / "few.session-2.yaml").read_text())["verify"] == str(tmp_path / "other.h5")
+    assert yaml.safe_load(first.read_text())["verify"] == str(tmp_path / "verify.h5")

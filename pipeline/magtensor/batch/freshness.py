@@ -11,8 +11,9 @@ from magtensor import provenance, result
 from magtensor.errors import MagtensorError
 from magtensor.provenance import Provenance
 from magtensor.recipe.plan import Plan
+from magtensor.survey.tables import existing
 
-LOCATION = ("file", "files")  # of the survey section: where the data lie says nothing of what they are
+LOCATION = ("file", "files")  # of the survey section: where the data lie says nothing of what they are; nor `verify`
 
 
 def why_run(folder: Path, planned: Plan) -> str:
@@ -29,7 +30,8 @@ def why_run(folder: Path, planned: Plan) -> str:
     except MagtensorError:
         return f"{result.RESULT} cannot be read"
     try:
-        now = provenance.collect(planned, (), planned.source().files())
+        verify = planned.verify and existing([planned.verify])[0]
+        now = provenance.collect(planned, (), planned.source().files(), verify)
     except MagtensorError as error:
         return f"input changed: {_first_line(error)}"
     return _changed(before, now) or _damage(folder, before)
@@ -50,6 +52,7 @@ def _changed(before: Provenance, now: Provenance) -> str:
 
 def _comparable(recipe: Mapping[str, Any]) -> Any:
     plain = json.loads(json.dumps(recipe, default=str))
+    plain.pop("verify", None)
     if isinstance(plain.get("survey"), dict):
         plain["survey"] = {k: v for k, v in plain["survey"].items() if k not in LOCATION}
     return plain

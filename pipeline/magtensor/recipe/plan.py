@@ -19,7 +19,7 @@ from magtensor.registry import Registry
 from magtensor.survey.sections import SurveySection
 from magtensor.survey.source import Source
 
-TOP_KEYS = ("title", "description", "authors", "references", "survey", "plugins", "stages")
+TOP_KEYS = ("title", "description", "authors", "references", "survey", "verify", "plugins", "stages")
 
 
 @dataclass(frozen=True)
@@ -56,6 +56,8 @@ class Plan:
         registry: the plugins it was made with.
         folder: what relative paths are relative to.
         file: the recipe's file, for messages.
+        plugins: folders, files and installed plugins that it cannot do without.
+        verify: a second survey in a uniform field, which the fit does not see; its error goes into the verdict.
     """
 
     title: str
@@ -68,6 +70,7 @@ class Plan:
     folder: Path
     file: str
     plugins: tuple[str, ...] = ()
+    verify: Path | None = None
 
     def source(self) -> Source:
         """Where the survey comes from.
@@ -95,6 +98,8 @@ class Plan:
         }
         if self.survey is not None:
             found["survey"] = self.survey.model_dump(mode="json", exclude_none=True, by_alias=True)
+        if self.verify is not None:
+            found["verify"] = str(self.verify)
         if self.plugins:
             found["plugins"] = list(self.plugins)
         found["stages"] = [{s.name: dict(s.described)} for s in self.stages]
@@ -107,6 +112,7 @@ def read_plan(
     overrides: Sequence[str] = (),
     plugin_folders: Sequence[Path] = (),
     survey: Path | None = None,
+    verify: Path | None = None,
 ) -> Plan:
     """Read a recipe file and plan it.
 
@@ -115,11 +121,12 @@ def read_plan(
         overrides: `PATH=VALUE` texts, e.g. `stages.align.to=S2` (see `override`).
         plugin_folders: folders of single-file plugins beside those the recipe names.
         survey: takes the place of the files of the recipe's survey section.
+        verify: takes the place of the recipe's own verification survey.
 
     Raises:
         UsageError: every mistake, with file and line.
     """
-    return plan(load_yaml(recipe), overrides=overrides, plugin_folders=plugin_folders, survey=survey)
+    return plan(load_yaml(recipe), overrides=overrides, plugin_folders=plugin_folders, survey=survey, verify=verify)
 
 
 def plan(
@@ -128,19 +135,22 @@ def plan(
     overrides: Sequence[str] = (),
     plugin_folders: Sequence[Path] = (),
     survey: Path | None = None,
+    verify: Path | None = None,
 ) -> Plan:
     """Plan a recipe that has been read; as `read_plan`."""
     for text in overrides:
         document = override(document, text)
-    return _Planner(document, plugin_folders, survey).plan()
+    return _Planner(document, plugin_folders, survey, verify).plan()
 
 
 class _Planner:
-    def __init__(self, document: Document, plugin_folders: Sequence[Path], survey: Path | None) -> None:
+    def __init__(
+        self, document: Document, plugin_folders: Sequence[Path], survey: Path | None, verify: Path | None
+    ) -> None:
         self.document = document
         self.problems = Problems(document)
         self.plugin_folders = plugin_folders
-        self.input = survey
+        self.input, self.verify = survey, verify
         self.registry = Registry()
 
     def plan(self) -> Plan:
@@ -155,7 +165,7 @@ class _Planner:
         description = self.text("description")
         authors, references = self.texts("authors"), self.texts("references")
         plugins = self.plugins()
-        survey = self.survey_section()
+        survey, verify = self.survey_section(), self.verification()
         stages = self.stages()
         self.check_flow(stages)
         if survey is not None and survey.with_ and not any(s.component.several for s in stages.values()):
@@ -165,7 +175,7 @@ class _Planner:
         self.problems.raise_if_any()
         return Plan(
             title, description, authors, references, survey, tuple(stages.values()), self.registry,
-            self.document.folder, self.document.file, plugins,
+            self.document.folder, self.document.file, plugins, verify,
         )  # fmt: skip
 
     def text(self, key: str, *, required: bool = False) -> str:
@@ -247,6 +257,16 @@ class _Planner:
             for place, message in Source(section, self.document.folder, readers(self.registry)).problems():
                 self.problems.add(("survey", *place.split(".")), message)
         return section
+
+    def verification(self) -> Path | None:
+        """The verification survey's file."""
+        value = self.document.value.get("verify")
+        if self.verify is not None or value is None:
+            return None if self.verify is None else Path(self.verify).resolve()
+        if not isinstance(value, str) or not value:
+            self.problems.add(("verify",), "must be one file, a second survey in a uniform field")
+            return None
+        return (self.document.folder / Path(value).expanduser()).resolve()
 
     def stages(self) -> dict[int, PlannedStage]:
         items = self.document.value.get("stages")
