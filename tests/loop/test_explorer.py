@@ -173,6 +173,18 @@ def constant(x):
     """What the offset contains."""
     return x.offsets(np.ones(len(x.time)), "nT")
 '''
+PARTLY = '''"""Half of it a constant."""
+import numpy as np
+from magtensor import error_model
+from magtensor.loop.terms import joined
+
+
+@error_model("instrument", needs=("current_heater",), source="diagram", typical="nT")
+def partly(x):
+    """The heater's field, and what the offset contains."""
+    heater = x.offsets(x.channel("current_heater"), "nT/A", "heater ")
+    return joined([heater, x.offsets(np.ones(len(x.time)), "nT", "constant ")])
+'''
 
 
 def test_what_the_calibration_has_already_is_refused(tmp_path: Path, explorer: Explorer) -> None:
@@ -191,6 +203,12 @@ def test_what_the_calibration_has_already_is_refused(tmp_path: Path, explorer: E
     assert passing & set(of_use.split(", "))
     if "of no use on held-out blocks: " in words:
         assert not passing & set(words.split("of no use on held-out blocks: ")[1].split("; ")[0].split(", "))
+    partly = tmp_path / "partly.py"
+    partly.write_text(PARTLY)
+    assert explorer.load_plugin(partly) == ["partly"]
+    told = explorer.adopt("partly")  # four sensors of three axes: the constants are offsets, the heater's field is new
+    assert "of the 24 directions of its coefficients 12 can be told from the calibration as it is" in told
+    assert "directions of its coefficients" not in explorer.decisions[0][1]
 
 
 def test_messages_of_what_is_refused(tmp_path: Path, survey: Path) -> None:

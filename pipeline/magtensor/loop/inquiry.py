@@ -5,7 +5,6 @@ Whatever a person adopts or rejects, the evidence is computed as for the loop's 
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -14,22 +13,20 @@ from magtensor.calibration.joint import calibrated
 from magtensor.calibration.types import Array
 from magtensor.components import Component
 from magtensor.errors import DataError, NotEnoughData, UsageError, did_you_mean
-from magtensor.loop.assessment import estimated
+from magtensor.loop import by_hand
+from magtensor.loop.by_hand import ByHand
 from magtensor.loop.decisions import Decision
-from magtensor.loop.latent import NAME, renewed, sought, tried_source
+from magtensor.loop.latent import NAME, sought
 from magtensor.loop.long_record import on_every_sample, part_of
 from magtensor.loop.model import Adopted, Fitting, Record, State, joint_state, without
 from magtensor.loop.needs import missing
-from magtensor.loop.outcome import described, removal, why
+from magtensor.loop.outcome import described
 from magtensor.loop.record import record_of
-from magtensor.loop.screening import Candidate, candidates_of, profiled, repeatable
-from magtensor.loop.search import Search, Step, adopt, search, simplest, with_lines
-from magtensor.loop.settings import AnyChannel
-from magtensor.loop.trial import trial
+from magtensor.loop.screening import Candidate, candidates_of, repeatable
+from magtensor.loop.search import Search, Step, search, with_lines
 from magtensor.survey.model import Survey
 
 PERSON, LOOP, DECLARED = "person", "loop", "declared"
-_ADOPTED = "{} is adopted already; reject it or undo first to adopt it otherwise"
 
 
 @dataclass(frozen=True)
@@ -173,43 +170,15 @@ class Inquiry:
         Returns, raises: as `decide`.
         """
         component, given = self._open(name), dict(settings or {})
-        _require_settings(component, given)
+        by_hand.require_settings(component, given)
         decision = Decision("adopt", name, given)
+        before = self.now
         if name == NAME:
-            return self._adopt_source(component, decision)
+            done = by_hand.source_adopted(before.record, before.state, component, self.how)
+            return self._advance(decision, done, (*before.by, PERSON))
         chosen = self._candidate(component, given)
-        before = self.now
-        _require_new_direction(chosen, before.state)
-        standing = trial(before.record, before.state, self.how)
-        after = trial(before.record, adopt(before.record, before.state, chosen, self.how), self.how)
-        record, state = renewed(before.record, after.state, self.how)
-        first, others = simplest(
-            chosen, [c for c in self.ranking() if c.predicts and c.model.name != name], before.state
-        )
-        rivals = tuple(sorted({first.model.name, *others} - {name}))
-        words = [_judged(chosen)]
-        if hurt := standing.hurt_by(after):
-            words.append(f"fitted, it raises the held-out error of {', '.join(hurt)}")
-        if not standing.likelier(after):
-            words.append("fitted together with the others, it leaves more than it takes away")
-        told = "; ".join(words)
-        step = Step(before.state, self.ranking() if chosen in self.ranking() else (chosen,), chosen, rivals)
-        self._advance(decision, told, record, state, (*before.by, PERSON), step)
-        return told
-
-    def _adopt_source(self, component: Component, decision: Decision) -> str:
-        before = self.now
-        shared = sought(before.state, before.record)
-        if shared is None:
-            raise NotEnoughData("the survey has too few sensors or samples to show a source that nobody logged")
-        shared, source = tried_source(component, before.record, before.state, shared, self.how, 1.0)
-        if source is None:
-            why_not = shared.objection or f"noise of the sensors alone explains it (p {shared.p:.2g})"
-            raise DataError(f"no source that nobody logged can be taken off: {why_not}")
-        told = f"p {shared.p:.2g}, held-out gain {shared.gain.total:.4g} (t {shared.gain.t:.2g})"
-        step = Step(before.state, (), source.evidence)
-        self._advance(decision, told, source.record, source.after, (*before.by, PERSON), step)
-        return told
+        done = by_hand.adopted(before.record, before.state, chosen, self.ranking(), self.how)
+        return self._advance(decision, done, (*before.by, PERSON))
 
     def reject(self, name: str) -> str:
         """Reject a model by hand: it is taken out if it was adopted, and not considered again.
@@ -227,20 +196,10 @@ class Inquiry:
                 raise UsageError(f"{name} is rejected already")
             told = self._words_of(component)
             rejected = {**(before.rejected or {}), name: told}
-            self._advance(decision, told, before.record, before.state, before.by, None, rejected)
-            return told
-        parts = []
-        for i in places:
-            worse, better = removal(before.state, i)
-            parts.append(f"held-out residual {better:.4g} nT with it, {worse:.4g} nT without")
-        told = f"taken out again: {'; '.join(parts)}"
-        rest = [i for i in range(len(before.by)) if i not in places]
-        record = before.record if name != NAME else replace(before.record, waveform=None)
-        adopted, theta = [before.state.adopted[i] for i in rest], [before.state.theta[i] for i in rest]
-        record, state = renewed(record, joint_state(record, adopted, self.how, theta), self.how)
-        rejected = {**(before.rejected or {}), name: told}
-        self._advance(decision, told, record, state, tuple(before.by[i] for i in rest), None, rejected)
-        return told
+            return self._advance(decision, ByHand(told, before.record, before.state, None), before.by, rejected)
+        done = by_hand.taken_out(before.record, before.state, places, self.how)
+        rejected = {**(before.rejected or {}), name: done.told}
+        return self._advance(decision, done, tuple(b for i, b in enumerate(before.by) if i not in places), rejected)
 
     def loop(self, leaving: Sequence[str] = ()) -> str:
         """Let the loop search, with all that is adopted kept and what was rejected left alone.
@@ -310,22 +269,16 @@ class Inquiry:
         return outcome
 
     def _advance(
-        self,
-        decision: Decision,
-        told: str,
-        record: Record,
-        state: State,
-        by: tuple[str, ...],
-        step: Step | None,
-        rejected: Mapping[str, str] | None = None,
-    ) -> None:
+        self, decision: Decision, done: ByHand, by: tuple[str, ...], rejected: Mapping[str, str] | None = None
+    ) -> str:
         before = self.now
         if rejected is None:
             rejected = {n: w for n, w in (before.rejected or {}).items() if n != decision.error_model}
-        steps = before.steps if step is None else (*before.steps, step)
-        made = (*before.made, (decision, told))
-        self._history.append(Moment(record, state, by, steps, made, rejected, before.failed))
+        steps = before.steps if done.step is None else (*before.steps, done.step)
+        made = (*before.made, (decision, done.told))
+        self._history.append(Moment(done.record, done.state, by, steps, made, rejected, before.failed))
         self._ranked = None
+        return done.told
 
     def _known(self, name: str) -> Component:
         if not isinstance(name, str):
@@ -342,7 +295,7 @@ class Inquiry:
     def _open(self, name: str) -> Component:
         component = self._known(name)
         if name in {a.name for a in self.now.state.adopted} and not repeatable(component):
-            raise UsageError(_ADOPTED.format(name))
+            raise UsageError(by_hand.ADOPTED.format(name))
         if lacks := self.lacks(component):
             logged = ", ".join(sorted(self.first.excitation.logged)) or "no channel"
             raise DataError(f"{name} needs {' and '.join(lacks)}, which this survey lacks; it logs {logged}")
@@ -354,31 +307,15 @@ class Inquiry:
             for candidate in self.ranking():
                 if candidate.model.name == component.name:
                     return candidate
-        channels = [n for n, g in profiled(component).items() if isinstance(g, AnyChannel) and n in given]
-        for adopted in self.now.state.adopted:
-            if adopted.name == component.name and given.items() <= adopted.settings.items():
-                raise UsageError(f"{component.name} is adopted already with these settings")
-            if adopted.name == component.name and any(adopted.settings.get(c) == given.get(c) for c in channels):
-                raise UsageError(_ADOPTED.format(component.name))
-        failed: dict[str, str] = {}
         state = with_lines(self.now.state, self.now.record, self._part.lines)
-        found = candidates_of(state, [pinned(component, given)], failed, self.alpha)
-        if not found:
-            if component.name not in failed and component.name in {a.name for a in self.now.state.adopted}:
-                raise UsageError(_ADOPTED.format(component.name))
-            reason = failed.get(component.name, "it has no regressor here that the calibration does not have already")
-            raise DataError(f"{component.name} cannot be fitted to this survey: {reason}")
-        models = max(len(self.open_models()), 1)
-        p, null_p = (min(1.0, each * models) for each in (found[0].adjusted_p, found[0].adjusted_null_p))
-        model = replace(found[0].model, settings={**given, **found[0].model.settings})
-        return replace(found[0], model=model, adjusted_p=p, adjusted_null_p=null_p)
+        return by_hand.candidate(component, given, state, len(self.open_models()), self.alpha)
 
     def _words_of(self, component: Component) -> str:
         if lacks := self.lacks(component):
             return f"it could not be tried: the survey lacks {' and '.join(lacks)}"
         for candidate in self.ranking():
             if candidate.model.name == component.name:
-                return _judged(candidate)
+                return by_hand.judged(candidate)
         return "not among the most promising when it was rejected"
 
 
@@ -403,55 +340,3 @@ def inquiry_of(
     names = {a.name for a in begin}
     open_ = [m for m in models if m.name not in names]
     return Inquiry(record, open_, how, declared=begin, most_effects=most_effects, alpha=alpha)
-
-
-def pinned(component: Component, settings: Mapping[str, Any]) -> Component:
-    """An error model with some of its settings held; the others stay open."""
-    if not settings:
-        return component
-
-    def held(x: Any, **rest: Any) -> Any:
-        return component.function(x, **{**settings, **rest})
-
-    first = next(iter(inspect.signature(component.function).parameters.values()))
-    free = [p for name, p in component.parameters.items() if name not in settings]
-    held.__signature__ = inspect.Signature([first, *free])  # type: ignore[attr-defined]
-    held.__doc__ = component.function.__doc__
-    return replace(component, function=held)
-
-
-def _require_new_direction(chosen: Candidate, state: State) -> None:
-    """Refuse a model whose regressors C, o and the adopted models can make already: its coefficients would be nothing.
-
-    Raises:
-        DataError: it is one.
-    """
-    known = 0 if state.terms is None else estimated(state.residual, state.terms, chosen.assessment.colours).rank
-    if chosen.assessment.estimate.rank <= known:
-        settings = "".join(f" {k}={v}" for k, v in chosen.model.settings.items())
-        raise DataError(
-            f"{chosen.model.name}{settings} cannot be told from the calibration as it is: it has no direction on this "
-            "survey that C, o and what is adopted do not have already"
-        )
-
-
-def _judged(candidate: Candidate) -> str:
-    gates = "passes the first two gates of the loop" if candidate.passes else "does not pass the gates of the loop"
-    return f"{gates}: {why(candidate, None)}"
-
-
-def _require_settings(component: Component, given: Mapping[str, Any]) -> None:
-    """Settings must be known, and of their type."""
-    from pydantic import ValidationError
-
-    known = list(component.parameters)
-    for name in given:
-        if name not in known:
-            near = did_you_mean(name, known) or (f"; it has {', '.join(known)}" if known else "; it has none")
-            raise UsageError(f"{component.name} has no setting {name!r}{near}")
-    try:
-        component.options.model_validate(dict(given))
-    except ValidationError as error:
-        for one in error.errors(include_url=False):
-            if one["type"] != "missing":
-                raise UsageError(f"{component.name}: {one['loc'][0]}: {one['msg']}") from None
