@@ -21,18 +21,16 @@ Rows that exist are not made again: the command goes on where it stopped, and wr
 from __future__ import annotations
 
 import argparse
-import json
 import os
-import time
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
-from loop_power import Trial, models, simulated
+import trials
+from loop_power import Trial, models, simulated, trial_of
 from loop_surveys import EFFECTS, recorded
 
 from magtensor.errors import MagtensorError
@@ -102,7 +100,7 @@ def page(rows: Sequence[dict[str, Any]]) -> str:
     for effect in EFFECTS:
         for amplitude in sorted({r["amplitude"] for r in rows if r["effect"] == effect}):
             lines.append(
-                _line(effect, amplitude, [r for r in rows if (r["effect"], r["amplitude"]) == (effect, amplitude)])
+                _cells(effect, amplitude, [r for r in rows if (r["effect"], r["amplitude"]) == (effect, amplitude)])
             )
     usable = [r for r in rows if r["outcome"] != "cannot be"]
     rivals = [r for r in usable if r["outcome"] == "rival"]
@@ -118,7 +116,7 @@ def page(rows: Sequence[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
-def _line(effect: str, amplitude: float, own: Sequence[dict[str, Any]]) -> str:
+def _cells(effect: str, amplitude: float, own: Sequence[dict[str, Any]]) -> str:
     usable = [r for r in own if r["outcome"] != "cannot be"]
     rivals = [r for r in usable if r["outcome"] == "rival"]
     told = [r for r in usable if r["outcome"] == "told"]
@@ -135,6 +133,11 @@ def _line(effect: str, amplitude: float, own: Sequence[dict[str, Any]]) -> str:
     return f"| {' | '.join(cells)} |"
 
 
+def line(row: dict[str, Any]) -> str:
+    """A row, as it is told when it is made."""
+    return " ".join([row["effect"], row["outcome"], ", ".join(row.get("adopted", ())), row["description"]])
+
+
 def _count(rows: Sequence[dict[str, Any]], outcome: str) -> int:
     return sum(r["outcome"] == outcome for r in rows)
 
@@ -144,42 +147,23 @@ def _median(rows: Sequence[dict[str, Any]], key: str) -> str:
     return f"{np.median(values):.3g}" if values else "unknown"
 
 
-def in_time(trial: Trial, end: float) -> dict[str, Any] | None:
-    """The row of a trial; None when the time is over."""
-    return tried(trial) if time.time() < end else None
-
-
 def main() -> None:
     """Run what is missing and write the page."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--rows", type=Path, required=True, help="one line of JSON a trial, read first and added to")
+    trials.add_options(parser)
     parser.add_argument("--page", type=Path, help="write the table here")
     parser.add_argument("--seeds", type=int, default=1, help="surveys of each effect and amplitude")
     parser.add_argument("--effects", default=",".join(EFFECTS))
     parser.add_argument("--amplitudes", default="3", help="rms of the effect in units of the white noise")
     parser.add_argument("--rate", type=float, default=2.0, help="Hz")
-    parser.add_argument("--seconds", type=float, default=np.inf, help="no trial is begun later")
-    parser.add_argument("--workers", type=int, default=2)
     chosen = parser.parse_args()
-    end = time.time() + chosen.seconds
-    chosen.rows.parent.mkdir(parents=True, exist_ok=True)
-    rows = [json.loads(line) for line in chosen.rows.open()] if chosen.rows.exists() else []
-    done = {tuple(row[key] for key in Trial._fields) for row in rows}
     planned = [
         Trial(effect, float(amplitude), "tumbling", NOISE, seed, chosen.rate)
         for seed in range(FIRST_SEED, FIRST_SEED + chosen.seeds)
         for amplitude in chosen.amplitudes.split(",")
         for effect in chosen.effects.split(",")
     ]
-    missing = [trial for trial in planned if tuple(trial) not in done]
-    with chosen.rows.open("a") as out, ProcessPoolExecutor(chosen.workers) as pool:
-        for row in pool.map(in_time, missing, [end] * len(missing)):
-            if row is None:
-                continue
-            rows.append(row)
-            out.write(json.dumps(row) + "\n")
-            out.flush()
-            print(row["effect"], row["outcome"], ", ".join(row.get("adopted", ())), row["description"])
+    rows, _ = trials.rows_of(chosen, planned, trial_of, tried, line)
     if chosen.page:
         chosen.page.write_text(page(rows))
 

@@ -25,19 +25,17 @@ from __future__ import annotations
 
 import argparse
 import itertools
-import json
 import os
 import time
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
+import trials
 from loop_surveys import recorded
 
 from magtensor.simulate import Simulated, simulate
@@ -202,7 +200,7 @@ def truth_of(flight: Flight) -> list[float]:
     return [float(np.polyfit(current, a, 1)[0]) for a in added.T]
 
 
-def trials(first_seed: int, repeats: int) -> Iterator[Flight]:
+def flights(first_seed: int, repeats: int) -> Iterator[Flight]:
     """Every survey of the study, clean ones first; circumstances turn over, no seed comes twice."""
     seed = first_seed
     noises = (1.0, 5.0, 20.0)
@@ -223,35 +221,27 @@ def trials(first_seed: int, repeats: int) -> Iterator[Flight]:
 def main() -> None:
     """Make the rows that are missing, then the page."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--rows", type=Path, default=Path("build/level_flight.jsonl"))
+    trials.add_options(parser)
     parser.add_argument("--page", type=Path)
-    parser.add_argument("--seconds", type=float, default=1200.0, help="begin no survey after so long")
     parser.add_argument("--first-seed", type=int, default=5000)
     parser.add_argument("--repeats", type=int, default=2)
-    parser.add_argument("--workers", type=int, default=1)
     given = parser.parse_args()
-    given.rows.parent.mkdir(parents=True, exist_ok=True)
-    rows = [json.loads(line) for line in given.rows.read_text().splitlines()] if given.rows.exists() else []
-    done = {tuple(row["flight"]) for row in rows}
-    stop = time.monotonic() + given.seconds
-    todo = [f for f in trials(given.first_seed, given.repeats) if tuple(f) not in done]
-    with ProcessPoolExecutor(given.workers) as pool, given.rows.open("a", encoding="utf-8") as file:
-        for flight, found in zip(todo, pool.map(partial(timely, stop), todo), strict=True):
-            if found is None:
-                continue
-            row = {"flight": list(flight)} | found
-            rows.append(row)
-            print(json.dumps(row), file=file, flush=True)
-            said = (found["verdict"], found.get("adopted"), found.get("why", ""))
-            print(" ".join(str(v) for v in flight), *said, flush=True)
+    wanted = flights(given.first_seed, given.repeats)
+    rows, _ = trials.rows_of(given, wanted, lambda row: row["flight"], tried, line)
     if given.page:
         given.page.write_text(page(rows), encoding="utf-8")
     print(table(rows))
 
 
-def timely(stop: float, flight: Flight) -> dict[str, Any] | None:
-    """The outcome, unless it is too late to begin."""
-    return outcome(flight) if time.monotonic() < stop else None
+def tried(flight: Flight) -> dict[str, Any]:
+    """The row of a survey."""
+    return {"flight": list(flight)} | outcome(flight)
+
+
+def line(row: dict[str, Any]) -> str:
+    """A row, as it is told when it is made."""
+    said = (row["verdict"], row.get("adopted"), row.get("why", ""))
+    return " ".join(str(v) for v in (*row["flight"], *said))
 
 
 VERDICTS = ("right", "shared", "more", "wrong", "told", "missed", "refused")

@@ -27,12 +27,9 @@ Rows that exist are not made again: the command goes on where it stopped, and wr
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import sys
-import time
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -42,6 +39,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import loop_power_page
 import numpy as np
+import trials
 from loop_surveys import BASE, EFFECTS, FAMILIES, MOTIONS, recorded, scenario
 
 from magtensor.components import Component
@@ -88,6 +86,11 @@ class Trial(NamedTuple):
     noise: str
     seed: int
     rate_Hz: float
+
+
+def trial_of(row: dict[str, Any]) -> Trial:
+    """The trial that a row is of."""
+    return Trial(*(row[key] for key in Trial._fields))
 
 
 @cache
@@ -219,15 +222,10 @@ def planned(chosen: argparse.Namespace) -> Iterator[Trial]:
             yield Trial(effects, 1.0, "tumbling", "white and 1/f", seed, chosen.rate)
 
 
-def in_time(trial: Trial, end: float) -> dict[str, Any] | None:
-    """The row of a trial; None when the time is over."""
-    return tried(trial) if time.time() < end else None
-
-
 def main() -> None:
     """Run what is missing and write the page."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--rows", type=Path, required=True, help="one line of JSON a trial, read first and added to")
+    trials.add_options(parser)
     parser.add_argument("--page", type=Path, help="write the tables here")
     parser.add_argument("--clean", type=int, default=10, help="clean surveys of each motion and noise")
     parser.add_argument("--seeds", type=int, default=1, help="surveys of each effect, amplitude, motion and noise")
@@ -237,26 +235,10 @@ def main() -> None:
     parser.add_argument("--motions", default=",".join(MOTIONS))
     parser.add_argument("--noises", default="white and 1/f", help=f"of the surveys with effects: {', '.join(NOISES)}")
     parser.add_argument("--rate", type=float, default=BASE["rate_Hz"], help="Hz")
-    parser.add_argument("--seconds", type=float, default=np.inf, help="no trial is begun later")
-    parser.add_argument("--workers", type=int, default=2)
     chosen = parser.parse_args()
-    end = time.time() + chosen.seconds
-    chosen.rows.parent.mkdir(parents=True, exist_ok=True)
-    rows = [json.loads(line) for line in chosen.rows.open()] if chosen.rows.exists() else []
-    done = {tuple(row[key] for key in Trial._fields) for row in rows}
-    missing = [trial for trial in planned(chosen) if tuple(trial) not in done]
-    with chosen.rows.open("a") as out, ProcessPoolExecutor(chosen.workers) as pool:
-        for row in pool.map(in_time, missing, [end] * len(missing)):
-            if row is None:
-                continue
-            rows.append(row)
-            out.write(json.dumps(row) + "\n")
-            out.flush()
-            print(loop_power_page.line(row), flush=True)
+    rows, open_ = trials.rows_of(chosen, planned(chosen), trial_of, tried, loop_power_page.line)
     if chosen.page:
         command = f"python studies/loop_power.py {' '.join(repr(a) if ' ' in a else a for a in sys.argv[1:])}"
-        made = {tuple(row[key] for key in Trial._fields) for row in rows}
-        open_ = sum(tuple(trial) not in made for trial in missing)
         chosen.page.write_text(loop_power_page.page(__doc__ or "", command, rows, open_))
 
 

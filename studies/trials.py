@@ -1,0 +1,66 @@
+"""Trials of a study side by side: those that a file of rows does not hold yet are made, and each is kept at once."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import time
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+Row = dict[str, Any]
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """The options of the command line that `rows_of` takes."""
+    parser.add_argument("--rows", type=Path, required=True, help="one line of JSON a trial, read first and added to")
+    parser.add_argument("--seconds", type=float, default=math.inf, help="no trial is begun later")
+    parser.add_argument("--workers", type=int, default=2)
+
+
+def rows_of(
+    chosen: argparse.Namespace,
+    trials: Iterable[tuple[Any, ...]],
+    trial_of: Callable[[Row], Sequence[Any]],
+    tried: Callable[[Any], Row],
+    line: Callable[[Row], str],
+) -> tuple[list[Row], int]:
+    """Make the rows that are missing.
+
+    Parameters
+    ----------
+    chosen: with what `add_options` asks for.
+    trials: that are wanted.
+    trial_of: the trial that a row is of.
+    tried: the row of a trial, a function of a module (it runs in other processes).
+    line: what is printed of a new row.
+
+    Returns
+    -------
+    All rows of the file, those of earlier runs first, and how many of the trials are still to be made.
+    """
+    end = time.time() + chosen.seconds
+    chosen.rows.parent.mkdir(parents=True, exist_ok=True)
+    rows = [json.loads(text) for text in chosen.rows.open()] if chosen.rows.exists() else []
+    known = {tuple(trial_of(row)) for row in rows}
+    missing = [trial for trial in trials if tuple(trial) not in known]
+    open_ = len(missing)
+    with chosen.rows.open("a") as out, ProcessPoolExecutor(chosen.workers) as pool:
+        for row in pool.map(partial(_in_time, tried, end), missing):
+            if row is None:
+                continue
+            rows.append(row)
+            open_ -= 1
+            out.write(json.dumps(row) + "\n")
+            out.flush()
+            print(line(row), flush=True)
+    return rows, open_
+
+
+def _in_time(tried: Callable[[Any], Row], end: float, trial: Any) -> Row | None:
+    """The row of a trial; None when the time is over."""
+    return tried(trial) if time.time() < end else None
