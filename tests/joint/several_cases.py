@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import pytest
 from joint_cases import FIELD_NT, Array, array, directions
 
 from magtensor.calibration.common_scale import nominal_scale
@@ -132,6 +134,19 @@ def errors(truth: Truth) -> Errors:
     open_ = (0 if truth.case.attitude_deg is not None else 3) + bool(truth.case.levels)
     rank = 9 * sensors + 3 * sensors * len(truth.offset) - open_
     return Errors(z, square, float(moved @ information @ moved) / rank)
+
+
+def require_as_stated(found: Sequence[Errors]) -> None:
+    """Errors of many draws are as large as their standard deviations say."""
+    pooled = np.array([f.standardised for f in found])
+    assert np.mean(pooled**2) == pytest.approx(1.0, abs=0.25)
+    assert 0.91 < np.mean(np.abs(pooled) < 1.96) < 0.985
+
+
+def require_at_bound(found: Sequence[Errors], parameters: int) -> None:
+    """Errors of many draws are those that noise allows, within four standard deviations of so many parameters."""
+    uncertainty = 1 / np.sqrt(2 * len(found) * parameters)
+    assert np.sqrt(np.mean([f.by_bound for f in found])) == pytest.approx(1.0, abs=4 * uncertainty)
 
 
 def bound_information(truth: Truth) -> Array:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from joint_cases import drawn
-from several_cases import Case, errors, fitted, surveys, true_matrix
+from several_cases import Case, errors, fitted, require_as_stated, require_at_bound, surveys, true_matrix
 
 from magtensor.calibration.joint import calibrated, fit_joint
 from magtensor.calibration.surveys.corrections import calibrated_surveys
@@ -43,11 +43,9 @@ def test_one_survey_is_the_joint_fit(sensors: int, reference_noise: float) -> No
 )
 def test_errors_are_those_that_noise_allows(case: Case) -> None:
     found = [errors(surveys(seed, case)) for seed in range(40)]
-    pooled = np.array([f.standardised for f in found])
-    assert np.mean(pooled**2) == pytest.approx(1.0, abs=0.25)
-    assert 0.91 < np.mean(np.abs(pooled) < 1.96) < 0.985
+    require_as_stated(found)
+    require_at_bound(found, parameters=12)
     assert np.mean([f.square for f in found]) == pytest.approx(1.0, abs=0.2)
-    assert np.sqrt(np.mean([f.by_bound for f in found])) == pytest.approx(1.0, abs=4 / np.sqrt(2 * 40 * 12))
 
 
 def test_postures_that_are_too_few_alone_suffice_together() -> None:
@@ -60,10 +58,8 @@ def test_postures_that_are_too_few_alone_suffice_together() -> None:
             with pytest.raises(NotEnoughData):
                 fit_joint(truth.samples.raw[own], truth.samples.total_field[own])
         found.append(errors(truth))
-    pooled = np.array([f.standardised for f in found])
-    assert np.mean(pooled**2) == pytest.approx(1.0, abs=0.25)
-    assert 0.91 < np.mean(np.abs(pooled) < 1.96) < 0.985
-    assert np.sqrt(np.mean([f.by_bound for f in found])) == pytest.approx(1.0, abs=4 / np.sqrt(2 * 30 * 105))
+    require_as_stated(found)
+    require_at_bound(found, parameters=105)
     fit_surveys(surveys(0, case).samples)  # and what a user's demands on coverage are
 
 
