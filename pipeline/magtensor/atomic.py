@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import platform
 import shutil
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -10,13 +11,17 @@ from pathlib import Path
 
 from magtensor.errors import UsageError
 
+PARTIAL = ".partial-"
+
 
 @contextmanager
 def atomic_path(path: Path) -> Iterator[Path]:
     """A temporary path in the same folder; renamed to `path` when the block ends well, removed when not."""
     path = Path(path)
     _make(path.parent)
-    temporary = path.with_name(f".{path.name}.partial-{os.getpid()}")
+    begun = f".{path.name}{PARTIAL}"
+    _clear(path.parent, begun)
+    temporary = path.with_name(begun + _mine())
     try:
         yield temporary
         os.replace(temporary, path)
@@ -40,7 +45,8 @@ def atomic_set(directory: Path, last: str) -> Iterator[Path]:
     """
     directory = Path(directory)
     _make(directory)
-    partial = directory / f".partial-{os.getpid()}"
+    _clear(directory, PARTIAL)
+    partial = directory / (PARTIAL + _mine())
     shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir()
     try:
@@ -52,6 +58,37 @@ def atomic_set(directory: Path, last: str) -> Iterator[Path]:
             os.replace(partial / name, directory / name)
     finally:
         shutil.rmtree(partial, ignore_errors=True)
+
+
+def _mine() -> str:
+    """The end of the names that this process uses: of what is half written, who is at it."""
+    return f"{platform.node()}-{os.getpid()}"
+
+
+def _clear(directory: Path, begun: str) -> None:
+    """Take away what processes of this machine have left half written that are no more: they were killed.
+
+    A process of another machine that shares the folder may live, whatever its number is here.
+    """
+    own = f"{begun}{platform.node()}-"
+    with suppress(OSError):
+        for left in directory.iterdir():
+            number = left.name.removeprefix(own)
+            if left.name.startswith(own) and number.isdecimal() and not _lives(int(number)):
+                shutil.rmtree(left) if left.is_dir() else left.unlink()
+
+
+def _lives(process: int) -> bool:
+    """Whether there is a process of this number; yes where that cannot be asked."""
+    if os.name != "posix":  # elsewhere the question would end it
+        return True
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except (OSError, OverflowError):  # another user's, or no number of a process
+        return True
+    return True
 
 
 def refuse_overwriting(outputs: Iterable[Path], inputs: Iterable[Path]) -> None:

@@ -72,7 +72,7 @@ class Component:
     kind: str
     name: str
     function: Callable[..., Any]
-    declares: Declares | Callable[[Mapping[str, Any]], Declares] = Declares()
+    declares: Declares | Callable[..., Declares] = Declares()
     step: str = ""  # of a method: the stage it serves
     source: str = ""  # paper and equations
     suffixes: tuple[str, ...] = ()  # of a reader: the file names it recognises
@@ -87,9 +87,15 @@ class Component:
         doc = inspect.getdoc(self.function) or ""
         return " ".join(doc.split("\n\n", 1)[0].split())
 
-    def declared(self, options: Mapping[str, Any]) -> Declares:
-        """What the stage touches when run with these options."""
-        return self.declares(options) if callable(self.declares) else self.declares
+    def declared(self, options: Mapping[str, Any], *, several: bool = False) -> Declares:
+        """What the stage touches when run with these options, on one survey or on several.
+
+        Raises:
+            UsageError: the options contradict each other.
+        """
+        if not callable(self.declares):
+            return self.declares
+        return self.declares(options, several=several) if self.several else self.declares(options)
 
     @cached_property
     def parameters(self) -> dict[str, inspect.Parameter]:
@@ -199,17 +205,19 @@ def stage(
     uses: Iterable[str] = (),
     gives: Iterable[str] = (),
     may_give: Iterable[str] = (),
-    declares: Callable[[Mapping[str, Any]], Declares] | None = None,
+    declares: Callable[..., Declares] | None = None,
     several: bool = False,
     long: Callable[..., Any] | None = None,
 ) -> Callable[[F], F]:
     """Mark ``function(survey, *, options) -> {path: variable}`` as a stage.
 
     The survey is read-only; what the function returns is merged into it by the runner, which checks both
-    against the declaration. `declares` replaces the four lists where they depend on the options.
+    against the declaration. `declares`, a function of the options, replaces the four lists where they depend on these;
+    it may refuse options that contradict each other (UsageError).
 
     A stage that fits the further surveys of a recipe (`survey: {with: ...}`) together with the survey is `several`; it
-    finds them in ``survey.source.further_surveys()``.
+    finds them in ``survey.source.further_surveys()``, and its `declares` takes the keyword `several`: whether there are
+    any.
 
     A stage that calibrates, and can do so from a recording that is read in pieces, names as `long` a function of
     ``(survey, recording, *, options)`` that returns the variables and the samples (N,) of the recording to flag; the

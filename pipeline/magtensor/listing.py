@@ -26,7 +26,7 @@ def _described(registry: Registry, component: Component) -> dict[str, Any]:
         "name": component.name,
         "summary": component.summary,
         "plugin": registry.origin[(component.kind, component.step, component.name)].origin,
-        "options": _finite(component.options.model_json_schema()),
+        "options": _finite(_schema(registry, component)),
     }
     if component.kind == "method":
         facts |= {"stage": component.step, "source": component.source}
@@ -45,6 +45,38 @@ def _described(registry: Registry, component: Component) -> dict[str, Any]:
     if component.suffixes:
         facts["suffixes"] = component.suffixes
     return facts
+
+
+def _schema(registry: Registry, component: Component) -> dict[str, Any]:
+    """The options as JSON schema, those that name a method, metrics or error models with what there is to name."""
+    schema = component.options.model_json_schema()
+    own, required = schema.get("properties", {}), list(schema.get("required", []))
+    choices: dict[str, Any] = {}
+    for option, kind in component.collections.items():
+        names = registry.names(kind)
+        default = component.parameters[option].default
+        choices[option] = {
+            "anyOf": [
+                {"type": "array", "items": {"enum": names}},
+                {"type": "object", "propertyNames": {"enum": names}},
+                {"type": "null"},
+            ],
+            "default": default if default is None else list(default),
+            "description": f"{kind.replace('_', ' ')}s: names, or `name: {{options}}`; null: all that are installed",
+        }
+    if component.method_option is not None:
+        option, default = component.method_option
+        choices[option] = {
+            "enum": registry.names("method", component.name),
+            "description": "its own options stand beside it; `magtensor plugins METHOD` lists them",
+        }
+        if default is None:
+            required.append(option)
+        else:
+            choices[option]["default"] = default
+    every = {**choices, **own}
+    schema["properties"] = {name: every[name] for name in component.parameters if name in every}
+    return schema | ({"required": required} if required else {})
 
 
 def _finite(value: Any) -> Any:
@@ -117,7 +149,7 @@ def show_one(registry: Registry, name: str) -> None:
         table = Table()
         for column in ("option", "type", "default", "meaning"):
             table.add_column(column, overflow="fold")
-        schema = component.options.model_json_schema()
+        schema = _schema(registry, component)
         required = schema.get("required", [])
         for option, facts in schema.get("properties", {}).items():
             default = "required" if option in required else json.dumps(facts.get("default"))

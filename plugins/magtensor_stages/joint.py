@@ -65,15 +65,15 @@ ALONE = (
 MEAN_OF_OWN = "calibrate_joint: offset_of: mean needs further surveys with offsets of their own"
 
 
-def declares(options: Mapping[str, Any]) -> Declares:
-    """What is needed depends on what is known of the field.
+def declares(options: Mapping[str, Any], *, several: bool = False) -> Declares:
+    """What is needed depends on what is known of the field; what agrees, on whether there are further surveys too.
 
     Raises:
         UsageError: options contradict each other.
     """
     field = _field(options["total_field"], options["total_field_nT"], options["vector_reference"])
     together = (options[name] for name in ("attitude_std_deg", "offsets", "offset_of", "error_models"))
-    _require_agreement(field, *together)
+    _require_agreement(field, *together, several=several)
     needs = ["b_raw", "total_field"] if field.measured and not field.vector else ["b_raw"]
     needs += ["segment"] if field.kind == "per_segment" else []
     needs += ["attitude", "reference/world_field"] if field.vector else []
@@ -91,13 +91,19 @@ def declares(options: Mapping[str, Any]) -> Declares:
 
 
 def _require_agreement(
-    field: joint_surveys.Field, attitude_std_deg: float | None, offsets: str, offset_of: str, error_models: object
+    field: joint_surveys.Field,
+    attitude_std_deg: float | None,
+    offsets: str,
+    offset_of: str,
+    error_models: object,
+    *,
+    several: bool,
 ) -> None:
     if attitude_std_deg is not None and not field.vector:
         raise UsageError("calibrate_joint: attitude_std_deg needs vector_reference: true; no attitude is used without")
-    if offset_of == "mean" and offsets == "common":
+    if offset_of == "mean" and (offsets == "common" or not several):
         raise UsageError(MEAN_OF_OWN)
-    if error_models and (field.vector or not field.measured):
+    if error_models and (field.vector or not field.measured or several):
         raise UsageError(ALONE)
 
 
@@ -160,17 +166,13 @@ def calibrate_joint(
 
     field = _field(total_field, total_field_nT, vector_reference)
     several = survey.source is not None and bool(survey.source.further_files())
-    _require_agreement(field, attitude_std_deg, offsets, offset_of, error_models)
-    if offset_of == "mean" and not several:
-        raise UsageError(MEAN_OF_OWN)
+    _require_agreement(field, attitude_std_deg, offsets, offset_of, error_models, several=several)
     if total_field == "measured" and total_field_nT is not None and joint_surveys.has_measured_field(survey):
         raise UsageError(
             f"calibrate_joint: total_field_nT: {total_field_nT:g} would put the survey's measured total field aside; "
             "leave it out, or say total_field: constant"
         )
     if error_models:
-        if several:
-            raise UsageError(ALONE)
         return _with_error_models(survey, dict(error_models), reference_noise_nT, robust, worst_error)
     if several or field.vector or field.kind.startswith("per_"):
         how = (reference_noise_nT, attitude_std_deg, robust, worst_error)

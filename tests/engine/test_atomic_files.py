@@ -113,6 +113,39 @@ def test_nothing_is_left_when_the_block_fails(tmp_path, error):
     assert (tmp_path / "x").read_text() == "old"
 
 
+HALF_WRITTEN = """
+import os, signal, sys
+from pathlib import Path
+from magtensor.atomic import atomic_path, atomic_set
+folder = Path(sys.argv[1])
+with atomic_set(folder, last="x") as partial, atomic_path(folder / "y") as temporary:
+    (partial / "x").write_text("half")
+    temporary.write_text("half")
+    print("written", flush=True)
+    sys.stdin.read()
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_what_a_killed_process_left_goes_with_the_next_run(tmp_path):
+    """And only that: not what a living process is writing, nor what another machine's may be."""
+    command = [sys.executable, "-c", HALF_WRITTEN, str(tmp_path)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+        assert process.stdout.readline() == b"written\n"
+        living = {f.name for f in tmp_path.iterdir()}
+        assert len(living) == 2
+        (tmp_path / f".partial-elsewhere-{process.pid}").mkdir()
+        write_text(tmp_path / "y", "whole")
+        with atomic_set(tmp_path, last="x"):
+            assert living < {f.name for f in tmp_path.iterdir()}
+        process.communicate()
+    assert living < {f.name for f in tmp_path.iterdir()}, "killed, it took nothing away itself"
+    with atomic_set(tmp_path, last="x") as folder:
+        (folder / "x").write_text("whole")
+    write_text(tmp_path / "y", "whole")
+    assert {f.name for f in tmp_path.iterdir()} == {"x", "y", f".partial-elsewhere-{process.pid}"}
+
+
 def test_text_is_written_whole(tmp_path):
     write_text(tmp_path / "deep/er/x.txt", "µT\n")
     assert (tmp_path / "deep/er/x.txt").read_bytes() == "µT\n".encode()

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import inspect
+import re
 import subprocess
 import sys
 
 import pytest
 
 from magtensor.components import Component
+from magtensor.listing import describe, show_one
 from magtensor.registry import Registry
 
 REGISTRY = Registry.load()
 BUILT_IN = {key: c for key, c in REGISTRY.components.items() if REGISTRY.origin[key].distribution == "magtensor"}
+
+
+LISTED = describe(REGISTRY)["components"]
 
 
 def label(key: tuple[str, str, str]) -> str:
@@ -39,6 +45,26 @@ def test_each_option_has_a_description(key):
     assert missing == []
     schema = model.model_json_schema()
     assert schema["additionalProperties"] is False
+
+
+@pytest.mark.parametrize("key", sorted(BUILT_IN), ids=label)
+def test_every_keyword_of_the_function_is_listed_as_an_option(key):
+    (listed,) = [c for c in LISTED if (c["kind"], c.get("stage", ""), c["name"]) == key]
+    keywords = [p for p in inspect.signature(BUILT_IN[key].function).parameters.values() if p.kind is p.KEYWORD_ONLY]
+    assert list(listed["options"].get("properties", {})) == [p.name for p in keywords]
+    required = {p.name for p in keywords if p.default is p.empty}
+    assert set(listed["options"].get("required", [])) == required
+
+
+def test_the_error_models_and_methods_that_an_option_may_name_are_shown(capsys):
+    show_one(REGISTRY, "close_loop")
+    told = capsys.readouterr().out
+    for option in ("declared", "search"):
+        assert re.search(rf"\b{option} .*array", told)
+    options = {c["name"]: c["options"]["properties"] for c in LISTED if c["kind"] == "stage"}
+    assert options["close_loop"]["search"]["default"] is None and options["close_loop"]["declared"]["default"] == []
+    assert "hysteresis" in options["close_loop"]["search"]["anyOf"][0]["items"]["enum"]
+    assert "li2018_linear" in options["calibrate_scalar"]["method"]["enum"]
 
 
 @pytest.mark.parametrize("key", sorted(k for k in BUILT_IN if k[0] == "method"), ids=label)

@@ -12,7 +12,7 @@ from scipy.stats import kstest
 from magtensor.calibration.types import ArrayCalibration
 from magtensor.loop.correction import corrected_raw, hidden_waveform
 from magtensor.loop.factor import noise_alone, with_factor
-from magtensor.loop.latent import ALPHA, sought, tried_source
+from magtensor.loop.latent import ALPHA, shared_words, sought, tried_source
 from magtensor.loop.model import Adopted, Fitting, Record
 from magtensor.loop.switching import two_levels
 from magtensor.loop.waveform import course_of, free_directions
@@ -160,6 +160,22 @@ def test_a_source_is_found_with_its_waveform_and_vectors() -> None:
     np.testing.assert_allclose(theta, 3.0 * VECTORS * WAVE.std(), atol=0.25)
     left = sought(source.after, source.record)
     assert left is not None and not left.significant
+
+
+@pytest.mark.parametrize("size", [0.2, 1.0, 5.0])
+@pytest.mark.parametrize("of_the_field", [0.0, 30.0])
+def test_the_share_of_a_source_is_what_it_explains(size: float, of_the_field: float) -> None:
+    """Of nine values with unit noise off the plane that the sensors share; what of it goes with the field is in C."""
+    clean = synthetic(2, N)
+    with_the_field = of_the_field * clean.raw[:, 0, 0] / 50_000.0
+    wave = size * (WAVE + with_the_field)
+    record = replace(clean, raw=clean.raw + wave[:, None, None] * VECTORS)
+    found = sought(linear_state(record), record)
+    assert found is not None
+    off_the_plane = float(np.sum((VECTORS - VECTORS.mean(axis=0)) ** 2))
+    power = size**2 * float(np.var(WAVE)) * off_the_plane
+    assert found.share == pytest.approx(power / (power + 9.0), rel=0.1, abs=0.02)
+    assert f"{found.share:.0%} of the variance of what differs between them" in shared_words(found, record.sensors)
 
 
 def slow(rng: np.random.Generator, shape: tuple[int, ...]) -> Array:

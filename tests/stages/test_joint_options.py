@@ -266,6 +266,26 @@ def test_mistakes(tmp_path: Path, options: str, further: str, status: int, said:
     assert said in done.output and "Traceback" not in done.output
 
 
+@pytest.mark.parametrize(
+    ("options", "further", "said"),
+    [
+        ("{offset_of: mean}", "", "offset_of: mean needs further surveys with offsets of their own"),
+        ("{offset_of: mean}", ", with: b.h5", ""),
+        ("{error_models: [temperature_offset]}", ", with: b.h5", "error_models are fitted to one survey"),
+        ("{error_models: [temperature_offset]}", "", ""),
+    ],
+)
+def test_what_further_surveys_contradict_is_found_without_data(
+    tmp_path: Path, options: str, further: str, said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recipe = tmp_path / "r.yaml"
+    survey = f"{{file: nowhere.h5{further}}}"
+    recipe.write_text(f"title: t\nsurvey: {survey}\nstages: [load, detrend_diurnal,\n  calibrate_joint: {options}]\n")
+    assert status_of(["validate", str(recipe)]) == (2 if said else 0)
+    told = capsys.readouterr().err
+    assert (f"{recipe}:4" in told and said in told) if said else not told
+
+
 def test_further_surveys_of_a_stage_that_has_no_use_for_them(tmp_path: Path) -> None:
     written(tmp_path / "a.h5", 3, reference=True)
     for stages in ("[load, detrend_diurnal, calibrate_scalar]", "[load, detrend_diurnal, close_loop]"):

@@ -76,21 +76,25 @@ class Processes:
         except OSError as error:
             return Outcome(2, f"{task.folder}: cannot be written: {error.strerror or error}", 0.0)
         with stderr:
-            with self._lock:
-                if self._stopped:
-                    return Outcome(128 + signal.SIGTERM, "stopped before it began", 0.0)
-                process = self._start(stderr.fileno())
-                self._running.add(process)
-            try:
-                outcome = _conversation(process, task)
-            finally:
-                with self._lock:
-                    self._running.discard(process)
-        if outcome is None:
-            outcome = _ended(process.returncode)
+            outcome = self._run(task, stderr.fileno())
         outcome = Outcome(outcome.exit_status, outcome.message, clock.perf_counter() - begin)
         _tidy(errors, outcome)
+        if outcome.exit_status:
+            with suppress(OSError):  # it holds what this or an earlier run left
+                task.folder.rmdir()
         return outcome
+
+    def _run(self, task: Task, stderr: int) -> Outcome:
+        with self._lock:
+            if self._stopped:
+                return Outcome(128 + signal.SIGTERM, "stopped before it began", 0.0)
+            process = self._start(stderr)
+            self._running.add(process)
+        try:
+            return _conversation(process, task) or _ended(process.returncode)
+        finally:
+            with self._lock:
+                self._running.discard(process)
 
     def _start(self, stderr: int) -> subprocess.Popen[bytes]:
         environment = {**dict.fromkeys(THREADS, "1"), **os.environ}

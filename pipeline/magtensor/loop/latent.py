@@ -50,7 +50,7 @@ class Sought:
         direction: (S, 3) nT per unit at each sensor, as far as it shows off the common plane.
         period_s: the shortest period in it.
         p: that noise of the sensors alone gives so strong a one, all bands considered.
-        share: of the variance across that it explains.
+        share: of the variance across that it explains, within 0 and 1: what C and o have taken of it is not there.
         gain: on held-out stretches, of each sensor's whitened residual predicted from the others.
         like: channel, lag s, power and correlation of the channel it follows; None where it follows none.
         switches: whether it has two levels.
@@ -121,7 +121,7 @@ def sought(state: State, record: Record) -> Sought | None:
         direction=(basis @ seen * residual.noise).reshape(-1, 3),
         period_s=float(np.median(np.diff(time))) / max(course.band, 0.5 / n),
         p=test.p,
-        share=float(seen @ seen / np.mean(np.sum(z**2, axis=1))),
+        share=_share(residual, z, values, seen),
         gain=gain,
         like=like,
         switches=course.switches,
@@ -197,6 +197,14 @@ def renewed(record: Record, state: State, how: Fitting) -> tuple[Record, State]:
     waveform = np.interp(record.time, record.time[state.residual.samples], course.values / course.rms)
     record = replace(record, waveform=waveform)
     return record, joint_state(record, state.adopted, how, state.theta, state.lines)
+
+
+def _share(residual: Residual, z: Array, values: Array, direction: Array) -> float:
+    """The part of the variance of z (N, m) that a waveform (N,) explains along a direction (m,)."""
+    left = values - residual.affine @ np.linalg.lstsq(residual.affine, values, rcond=1e-12)[0]
+    along = z @ direction
+    whole = float(left @ left) * float(direction @ direction) * float(np.sum(z**2))
+    return float(left @ along) ** 2 / whole if whole else 0.0
 
 
 def _put_back(state: State) -> tuple[Array, Array] | None:
@@ -354,7 +362,10 @@ def shared_words(found: Sought, sensors: Sequence[str]) -> str:
     strength = np.sqrt(np.sum(found.direction**2, axis=1))
     each = ", ".join(f"{s} {a:.2g} nT" for s, a in zip(sensors, strength, strict=True))
     course = "switches between two levels" if found.switches else f"has periods from {found.period_s:.2g} s on"
-    words = f"the sensors share one waveform ({found.share:.0%} of the residual between them; {each}), which {course}"
+    part = f"{found.share:.0%}" if found.share >= 0.01 else "less than 1%"
+    words = (
+        f"the sensors share one waveform ({each}; {part} of the variance of what differs between them), which {course}"
+    )
     if found.like is not None:
         name, lag, power, correlation = found.like
         to_the = "" if power == 1 else f" to the power {power}"

@@ -152,6 +152,7 @@ class _Planner:
         self.plugin_folders = plugin_folders
         self.input, self.verify = survey, verify
         self.registry = Registry()
+        self.several = False
 
     def plan(self) -> Plan:
         value = self.document.value
@@ -166,9 +167,10 @@ class _Planner:
         authors, references = self.texts("authors"), self.texts("references")
         plugins = self.plugins()
         survey, verify = self.survey_section(), self.verification()
+        self.several = survey is not None and bool(survey.with_)
         stages = self.stages()
         self.check_flow(stages)
-        if survey is not None and survey.with_ and not any(s.component.several for s in stages.values()):
+        if self.several and not any(s.component.several for s in stages.values()):
             able = sorted(c.name for c in self.registry.components.values() if c.several)
             what = f"no stage here fits several surveys together; {', '.join(able)} does"
             self.problems.add(("survey", "with"), what)
@@ -338,7 +340,7 @@ class _Planner:
             return None
         described |= model.model_dump(mode="json")
         try:
-            declares = component.declared(described)
+            declares = component.declared(described, several=self.several)
         except UsageError as error:  # options that contradict each other
             self.problems.add(at, str(error).removeprefix(f"{component.name}: "))
             return None
