@@ -59,13 +59,9 @@ class PosturesSpec(Spec):
         return (self.turntable_steps + self.random_count) * (self.rest_s + self.turn_s) - self.turn_s
 
 
-class EulerGridSpec(Spec):
-    """One sample in each attitude of a full grid of three angles (Li 2018 section 4)."""
+class EulerSpec(Spec):
+    """What three successive rotations mean."""
 
-    type: Literal["euler_grid"]
-    step_deg: float = Field(
-        20.0, gt=0, le=180, description="step of each of the three angles over the full circle, deg"
-    )
     sequence: Sequence3 = Field(
         "yxz",
         description=(
@@ -76,13 +72,22 @@ class EulerGridSpec(Spec):
         "NED", description="world axes the platform axes lie along at zero angles"
     )
 
+
+class EulerGridSpec(EulerSpec):
+    """One sample in each attitude of a full grid of three angles (Li 2018 section 4)."""
+
+    type: Literal["euler_grid"]
+    step_deg: float = Field(
+        20.0, gt=0, le=180, description="step of each of the three angles over the full circle, deg"
+    )
+
     @property
     def count(self) -> int:
         """Number of attitudes."""
         return ceil(360.0 / self.step_deg - 1e-9) ** 3
 
 
-class RandomAttitudesSpec(Spec):
+class RandomAttitudesSpec(EulerSpec):
     """One sample in each of a number of independent random attitudes."""
 
     type: Literal["random_attitudes"]
@@ -92,15 +97,6 @@ class RandomAttitudesSpec(Spec):
         description=(
             "null: uniform over all attitudes; else the angles about x, y, z are uniform within +- these limits, deg"
         ),
-    )
-    sequence: Sequence3 = Field(
-        "yxz",
-        description=(
-            "order of the three rotations from the world to the platform frame, the last one first: yxz means Ry Rx Rz"
-        ),
-    )
-    zero_frame: Literal["ENU", "NED"] = Field(
-        "NED", description="world axes the platform axes lie along at zero angles"
     )
 
 
@@ -149,6 +145,6 @@ MotionSpec = Annotated[
 
 def length_s(spec: MotionSpec, rate_Hz: float) -> float:
     """Length of the survey, s."""
-    if isinstance(spec, EulerGridSpec | RandomAttitudesSpec):
+    if isinstance(spec, EulerSpec):
         return spec.count / rate_Hz
     return spec.duration_s

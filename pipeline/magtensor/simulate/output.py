@@ -5,10 +5,12 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from magtensor.atomic import atomic_path
 from magtensor.simulate.gradiometers import COMPONENTS
 from magtensor.simulate.run import Simulated, Truth
 
@@ -23,20 +25,12 @@ def write(simulated: Simulated, path: str | os.PathLike[str]) -> None:
     """
     import h5py
 
-    target = os.fspath(path)
-    os.makedirs(os.path.dirname(target) or ".", exist_ok=True)
-    partial = f"{target}.{os.getpid()}.partial"
-    try:
-        with h5py.File(partial, "w") as file:
-            _write_survey(file, simulated)
-            if simulated.reference is not None:
-                _write_reference(file, simulated)
-            if simulated.scenario.truth:
-                _write_truth(file, simulated)
-        os.replace(partial, target)
-    finally:
-        if os.path.exists(partial):
-            os.remove(partial)
+    with atomic_path(Path(path)) as partial, h5py.File(partial, "w") as file:
+        _write_survey(file, simulated)
+        if simulated.reference is not None:
+            _write_reference(file, simulated)
+        if simulated.scenario.truth:
+            _write_truth(file, simulated)
 
 
 def _time_units(simulated: Simulated) -> str:

@@ -17,35 +17,38 @@ def _about_reference(bench: Bench, values: Array, reference: float | None) -> Ar
     return values - (bench.kept_mean(values) if reference is None else reference)
 
 
-class TemperatureOffset(SensorEffectSpec):
+class LaggingTemperature(SensorEffectSpec):
+    """What follows the temperature of the sensor, which lags the logged one."""
+
+    channel: str = Field("temperature", description="temperature channel")
+    lag_s: float = Field(0.0, ge=0, description="thermal time constant between the channel and the sensor, s")
+    reference_degC: float | None = Field(None, description="temperature at which it is nil; null: the survey's mean")
+
+    def change(self, bench: Bench) -> Array:
+        """(N, S) degC of the sensors, less the reference."""
+        return _about_reference(bench, bench.lagged_channel(self.channel, self.lag_s, self.name), self.reference_degC)
+
+
+class TemperatureOffset(LaggingTemperature):
     """The offset follows the temperature of the sensor, which lags the logged one."""
 
     COEFFICIENTS = "nT_per_degC"
     type: Literal["temperature_offset"]
     nT_per_degC: PerSensor | None = Field(None, description="x, y, z, for all sensors or for each")
-    channel: str = Field("temperature", description="temperature channel")
-    lag_s: float = Field(0.0, ge=0, description="thermal time constant between the channel and the sensor, s")
-    reference_degC: float | None = Field(None, description="temperature at which it is nil; null: the survey's mean")
 
     def waveform(self, bench: Bench, coefficients: Array) -> Array:
-        inside = bench.lagged_channel(self.channel, self.lag_s, self.name)
-        return _about_reference(bench, inside, self.reference_degC)[..., None] * coefficients
+        return self.change(bench)[..., None] * coefficients
 
 
-class TemperatureScale(SensorEffectSpec):
+class TemperatureScale(LaggingTemperature):
     """The scale factors follow the temperature of the sensor, which lags the logged one."""
 
     COEFFICIENTS = "ppm_per_degC"
     type: Literal["temperature_scale"]
     ppm_per_degC: PerSensor | None = Field(None, description="x, y, z, for all sensors or for each")
-    channel: str = Field("temperature", description="temperature channel")
-    lag_s: float = Field(0.0, ge=0, description="thermal time constant between the channel and the sensor, s")
-    reference_degC: float | None = Field(None, description="temperature at which it is nil; null: the survey's mean")
 
     def waveform(self, bench: Bench, coefficients: Array) -> Array:
-        inside = bench.lagged_channel(self.channel, self.lag_s, self.name)
-        change = _about_reference(bench, inside, self.reference_degC)
-        return bench.sensed(bench.b) * (1e-6 * coefficients) * change[..., None]
+        return bench.sensed(bench.b) * (1e-6 * coefficients) * self.change(bench)[..., None]
 
 
 class TemperatureRate(SensorEffectSpec):
