@@ -40,6 +40,7 @@ from magtensor.tensor.refinement import (
     scale_verdict,
     similarity,
 )
+from magtensor_methods.tensor_options import Prior
 
 SCALE_UNIDENTIFIED = (
     "the scale of the corrected tensor is unidentified: only that its invariants are constant was used; given is the "
@@ -58,10 +59,7 @@ def orbit_likelihood(
     invariant_2: float | None,
     noise_covariance: Array | None = None,
     *,
-    prior: Annotated[
-        list[list[float]] | None,
-        Field(description="5 x 5 H to start from and to which the gauge is fixed; the identity when not given"),
-    ] = None,
+    prior: Prior = None,
     robust: Annotated[bool, Field(description="leave out samples that no noise explains")] = True,
 ) -> TensorCalibration:
     """H and D of G5 = H T5 + D by maximum likelihood: every true tensor is Q G0 Q' for some rotation Q.

@@ -47,6 +47,7 @@ from magtensor.tensor.refinement import (
     scale_verdict,
     similarity,
 )
+from magtensor_methods.tensor_options import Prior
 
 Array = NDArray[np.float64]
 
@@ -64,10 +65,7 @@ def sui2017(
         Literal["mean", "zero"],
         Field(description="where the quadric of eq. 12 is 0 instead of 1: at the mean tensor, or at zero as printed"),
     ] = "mean",
-    prior: Annotated[
-        list[list[float]] | None,
-        Field(description="5 x 5 H to start from and to which the gauge is fixed; the identity when not given"),
-    ] = None,
+    prior: Prior = None,
 ) -> TensorCalibration:
     """H and D of G5 = H T5 + D from I1 and I2, modulo the common rotation that no invariant shows.
 

@@ -146,29 +146,34 @@ class OffsetStep(SensorEffectSpec):
         return jumps[:, None, None] * coefficients
 
 
-class SupplyScale(SensorEffectSpec):
+class FromSupply(SensorEffectSpec):
+    """What follows the supply voltage."""
+
+    channel: str = Field("supply_voltage", description="supply channel")
+    reference_V: float | None = Field(None, description="voltage at which it is nil; null: the survey's mean")
+
+    def change(self, bench: Bench) -> Array:
+        """(N, S) V, less the reference."""
+        return _about_reference(bench, bench.channel(self.channel, self.name), self.reference_V)
+
+
+class SupplyScale(FromSupply):
     """The scale factors follow the supply voltage."""
 
     COEFFICIENTS = "ppm_per_V"
     type: Literal["supply_scale"]
     ppm_per_V: PerSensor | None = Field(None, description="x, y, z, for all sensors or for each")
-    channel: str = Field("supply_voltage", description="supply channel")
-    reference_V: float | None = Field(None, description="voltage at which it is nil; null: the survey's mean")
 
     def waveform(self, bench: Bench, coefficients: Array) -> Array:
-        change = _about_reference(bench, bench.channel(self.channel, self.name), self.reference_V)
-        return bench.sensed(bench.b) * (1e-6 * coefficients) * change[..., None]
+        return bench.sensed(bench.b) * (1e-6 * coefficients) * self.change(bench)[..., None]
 
 
-class SupplyOffset(SensorEffectSpec):
+class SupplyOffset(FromSupply):
     """The offset follows the supply voltage."""
 
     COEFFICIENTS = "nT_per_V"
     type: Literal["supply_offset"]
     nT_per_V: PerSensor | None = Field(None, description="x, y, z, for all sensors or for each")
-    channel: str = Field("supply_voltage", description="supply channel")
-    reference_V: float | None = Field(None, description="voltage at which it is nil; null: the survey's mean")
 
     def waveform(self, bench: Bench, coefficients: Array) -> Array:
-        change = _about_reference(bench, bench.channel(self.channel, self.name), self.reference_V)
-        return change[..., None] * coefficients
+        return self.change(bench)[..., None] * coefficients
