@@ -67,6 +67,8 @@ RIGHT: dict[str, dict[str, Any]] = {
     "supply_offset": {"channel": "supply_voltage"},
     "hysteresis": {"half_width_nT": 4000.0},
     "offset_step": {"time_s": 800.0},
+    "scale_step": {"time_s": 1000.0},
+    "turn_step": {"time_s": 1000.0},
     "sampling_lag": {"per_axis": True},
     "viscous_magnetisation": {"tau_s": 20.0},
     "moving_part": {"channel": "encoder"},

@@ -66,6 +66,8 @@ EFFECTS: dict[str, dict[str, Any]] = {
     "cross_field": {},
     "hysteresis": {"half_width_nT": [4000.0]},
     "offset_step": {"time_s": [800.0]},
+    "scale_step": {"time_s": [1000.0], "sensors": ["S2"]},
+    "turn_step": {"time_s": 1000.0, "sensors": ["S2"]},
     "sampling_lag": {"per_axis": True},
     "eddy_current": {},
     "bandwidth": {},
@@ -85,7 +87,7 @@ EFFECTS: dict[str, dict[str, Any]] = {
 }
 FAMILIES = (
     ("temperature_offset", "temperature_rate", "offset_drift", "warm_up", "supply_offset", "offset_step"),
-    ("temperature_scale", "scale_drift", "supply_scale"),
+    ("temperature_scale", "scale_drift", "supply_scale", "scale_step", "turn_step"),
     ("nonlinearity_quadratic", "nonlinearity_cubic", "cross_field"),
     ("hysteresis", "sampling_lag", "eddy_current", "bandwidth", "clock_drift", "viscous_magnetisation"),
     ("current_field", "moving_part", "periodic_interference", "frame_flexure", "channel_response", "latent_source"),

@@ -1,11 +1,11 @@
 """Built-in error models: the catalogue of docs/error_models.md."""
 
-from magtensor_effects.ageing import offset_drift, offset_step, scale_drift, warm_up
+from magtensor_effects.ageing import offset_drift, offset_step, scale_drift, scale_step, warm_up
 from magtensor_effects.channels import channel_response, moving_part, periodic_interference
 from magtensor_effects.geometry import baseline_expansion, finite_baseline, position_error
 from magtensor_effects.inertia import bandwidth, clock_drift, eddy_current, sampling_lag, viscous_magnetisation
 from magtensor_effects.latent import latent_source
-from magtensor_effects.mechanics import crosstalk, frame_flexure
+from magtensor_effects.mechanics import crosstalk, frame_flexure, turn_step
 from magtensor_effects.power import current_field, supply_offset, supply_scale
 from magtensor_effects.reference import reference_clock, reference_scale, reference_step
 from magtensor_effects.site import fixed_source, passing_source, site_gradient
@@ -39,12 +39,14 @@ __all__ = [
     "reference_step",
     "sampling_lag",
     "scale_drift",
+    "scale_step",
     "site_gradient",
     "supply_offset",
     "supply_scale",
     "temperature_offset",
     "temperature_rate",
     "temperature_scale",
+    "turn_step",
     "viscous_magnetisation",
     "warm_up",
 ]

@@ -8,15 +8,17 @@ from pydantic import Field
 from magtensor.calibration.types import Array
 from magtensor.components import error_model
 from magtensor.loop.excitation import Excitation
-from magtensor.loop.settings import Choice, Duration, EventTimes, Range
+from magtensor.loop.settings import Duration, EventTimes, Orders, Range
 from magtensor.loop.terms import Terms, joined
 
-Order = Annotated[int, Choice((1, 2, 3)), Field(ge=1, le=3, description="highest power of time")]
+Order = Annotated[int, Orders((1, 2, 3)), Field(ge=1, le=3, description="highest power of time")]
 Span = Annotated[
     float,
     Duration(),
     Field(gt=0, description="time from the start over which the course is known, s; later it stays as at the end"),
 ]
+
+EventTime = Annotated[float, EventTimes(), Field(description="time of the jump, s since the survey's start")]
 
 
 def _courses(x: Excitation, order: int, span_s: float) -> list[Array]:
@@ -76,14 +78,24 @@ def warm_up(
     source="perming of fluxgate cores",
     typical="1 to 10 nT after a shock, or from one posture to the next",
 )
-def offset_step(
-    x: Excitation,
-    *,
-    time_s: Annotated[float, EventTimes(), Field(description="time of the jump, s since the survey's start")] = 0.0,
-) -> Terms:
+def offset_step(x: Excitation, *, time_s: EventTime = 0.0) -> Terms:
     """Each axis's offset jumps at a time: a core was magnetised by a shock, a connector touched.
 
     One coefficient an axis; several jumps are several models of this name. Rival: `offset_drift` for a jump in the
     middle of a short survey.
     """
     return x.offsets((x.elapsed >= time_s).astype(float), "nT")
+
+
+@error_model(
+    "instrument",
+    source="diagonal part of a jump of C",
+    typical="5 nT for 100 ppm: a range switched, a feedback resistor or reference voltage that has changed",
+)
+def scale_step(x: Excitation, *, time_s: EventTime = 0.0) -> Terms:
+    """Each axis's scale factor jumps at a time: a range, a feedback resistor or a reference voltage changed.
+
+    One coefficient an axis times its own output; several jumps are several models of this name. Rivals: `scale_drift`
+    for a jump in the middle of a short survey, `offset_step` where the attitude hardly changes.
+    """
+    return x.scales(np.where(x.elapsed >= time_s, 1e-6, 0.0), "ppm")

@@ -6,14 +6,15 @@ from pydantic import Field
 
 from magtensor.components import error_model
 from magtensor.loop.excitation import Excitation
-from magtensor.loop.settings import AnyChannel, Range
-from magtensor.loop.terms import Terms
+from magtensor.loop.settings import AnyChannel, Orders, Range
+from magtensor.loop.terms import Terms, joined
 
 THERMOMETER = AnyChannel("temperature*", or_units="degC", vectors=False)
 
 Thermometer = Annotated[
     str, THERMOMETER, Field(description="temperature channel, one for all sensors or one for each; '': the only one")
 ]
+Order = Annotated[int, Orders((1, 2)), Field(ge=1, le=2, description="highest power of the temperature")]
 ThermalLag = Annotated[
     float,
     Range(0.0, 600.0, count=8, spacing="log"),
@@ -27,15 +28,17 @@ ThermalLag = Annotated[
     source="first-order thermal lag; coefficients as in Olsen et al. 2020 (CryoSat-2)",
     typical="0.1 nT/degC for a good fluxgate; thermal lags of minutes",
 )
-def temperature_offset(x: Excitation, *, channel: Thermometer = "", lag_s: ThermalLag = 0.0) -> Terms:
+def temperature_offset(x: Excitation, *, order: Order = 1, channel: Thermometer = "", lag_s: ThermalLag = 0.0) -> Terms:
     """Each axis's offset follows the temperature of the sensor, which lags the thermometer.
 
-    The thermometer is seen through a first-order lag, also across gaps in the recording. One coefficient an axis.
-    Rivals: `offset_drift` and `warm_up` where the temperature rises steadily; `temperature_scale` where the attitude
-    hardly changes; `temperature_rate` for short lags.
+    The thermometer is seen through a first-order lag, also across gaps in the recording. One coefficient an axis and
+    power; powers are of the difference from the calibration survey's mean. Rivals: `offset_drift` and `warm_up` where
+    the temperature rises steadily; `temperature_scale` where the attitude hardly changes; `temperature_rate` for
+    short lags.
     """
     name = THERMOMETER.pick(x, channel)
-    return x.offsets(x.lagged(x.thermometer(name), lag_s), f"nT/{x.units[name]}")
+    course = x.lagged(x.thermometer(name), lag_s)
+    return joined([x.offsets(course**k, f"nT/{units}", label) for k, units, label in _powers(x.units[name], order)])
 
 
 @error_model(
@@ -44,14 +47,16 @@ def temperature_offset(x: Excitation, *, channel: Thermometer = "", lag_s: Therm
     source="Toffner-Clausen et al. 2016 (Swarm); Olsen et al. 2020 (CryoSat-2)",
     typical="20 ppm/degC for a fluxgate, 100 for an orthogonal one, below 1 for Swarm after correction",
 )
-def temperature_scale(x: Excitation, *, channel: Thermometer = "", lag_s: ThermalLag = 0.0) -> Terms:
+def temperature_scale(x: Excitation, *, order: Order = 1, channel: Thermometer = "", lag_s: ThermalLag = 0.0) -> Terms:
     """Each axis's scale factor follows the temperature of the sensor, which lags the thermometer.
 
-    The lagged temperature times the axis's own output. One coefficient an axis. Rivals: `temperature_offset` where
-    the attitude hardly changes; `scale_drift` where the temperature rises steadily.
+    The lagged temperature times the axis's own output. One coefficient an axis and power. Rivals:
+    `temperature_offset` where the attitude hardly changes; `scale_drift` where the temperature rises steadily.
     """
     name = THERMOMETER.pick(x, channel)
-    return x.scales(1e-6 * x.lagged(x.thermometer(name), lag_s), f"ppm/{x.units[name]}")
+    course = x.lagged(x.thermometer(name), lag_s)
+    powers = _powers(x.units[name], order)
+    return joined([x.scales(1e-6 * course**k, f"ppm/{units}", label) for k, units, label in powers])
 
 
 @error_model(
@@ -79,3 +84,8 @@ def temperature_rate(
     name = THERMOMETER.pick(x, channel)
     skin = x.thermometer(name)
     return x.offsets(skin - x.lagged(skin, tau_s), f"nT/{x.units[name]}")
+
+
+def _powers(units: str, order: int) -> list[tuple[int, str, str]]:
+    """Powers up to an order, with the units of each and what the names of its coefficients begin with."""
+    return [(k, units if k == 1 else f"({units})^{k}", "" if k == 1 else f"power {k} ") for k in range(1, order + 1)]

@@ -74,6 +74,7 @@ PER_AXIS: list[tuple[str, dict[str, Any], dict[str, Any], float, float]] = [
     ("temperature_rate", {"tau_s": 20.0}, {"nT_per_degC": drawn(1), "tau_s": 20.0}, 0.03, 1.0),
     ("warm_up", {"tau_s": 50.0}, {"nT": drawn(10), "tau_s": 50.0}, 1e-6, 1.0),
     ("offset_step", {"time_s": 77.0}, {"nT": drawn(5), "time_s": [77.0]}, 1e-6, 1.0),
+    ("scale_step", {"time_s": 77.0}, {"ppm": drawn(100), "time_s": [77.0]}, 0.005, 1.0),
     ("supply_scale", {}, {"ppm_per_V": drawn(30)}, 0.01, 1.0),
     ("supply_offset", {}, {"nT_per_V": drawn(30)}, 0.01, 1.0),
     ("nonlinearity_quadratic", {}, {"nT_at_full_scale": drawn(3)}, 1e-6, 1.0),
@@ -224,6 +225,29 @@ def test_frame_flexure_in_arcmin_per_g(known_by: str) -> None:
     assert fit.left < 0.005
     # the simulator's g is 9.81; second order is one arcmin, 3e-4
     np.testing.assert_allclose(per_matrix(fit, survey.sensors), bends, atol=0.01)
+
+
+def test_turn_step_in_arcmin() -> None:
+    # second order of 3 arcmin: 1e-3
+    fit, survey, _ = fitted("turn_step", {"time_s": 77.0}, {"arcmin": drawn(3), "time_s": 77.0})
+    assert fit.left < 0.005
+    np.testing.assert_allclose(per_axis(fit, survey.sensors), truth_of(survey), atol=0.01)
+
+
+@pytest.mark.parametrize(("name", "units"), [("temperature_offset", "nT"), ("temperature_scale", "ppm")])
+def test_the_second_order_of_temperature_holds_the_first(name: str, units: str) -> None:
+    # b (T - 20 degC)^2, lagged: about the mean of the survey it has a linear part of 2 b (mean - 20)
+    true = drawn(0.1 if units == "nT" else 5.0)
+    effect = {"nT_per_unit": true, "channel": "temperature", "power": 2, "lag_s": 10.0, "reference": 20.0}
+    effect |= {"times_field": units == "ppm"}
+    settings = {"order": 2, "lag_s": 10.0}
+    fit, survey, x = fitted(name, settings, effect, simulated_as="channel_response")
+    assert fit.left < 0.01
+    mean = float(survey.channels["temperature"][0].mean())
+    np.testing.assert_allclose(per_axis(fit, survey.sensors, "power 2 "), true, atol=0.02 * np.abs(true).max())
+    linear = 2.0 * (mean - 20.0) * np.array(true)
+    np.testing.assert_allclose(per_axis(fit, survey.sensors), linear, atol=0.02 * np.abs(linear).max())
+    assert set(model(name).function(x, **settings).units) == {f"{units}/degC", f"{units}/(degC)^2"}
 
 
 @pytest.mark.parametrize(

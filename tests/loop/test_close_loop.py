@@ -6,6 +6,7 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -174,9 +175,17 @@ def test_importing_is_light() -> None:
     assert said.stdout.strip() == "[]"
 
 
-def test_a_jump_lasts_into_later_surveys(tmp_path: Path) -> None:
+JUMPS: dict[str, dict[str, Any]] = {
+    "offset_step": {"time_s": [300.0]},
+    "scale_step": {"time_s": [300.0]},
+    "turn_step": {"time_s": 300.0},
+}
+
+
+@pytest.mark.parametrize("effect", JUMPS)
+def test_a_jump_lasts_into_later_surveys(effect: str, tmp_path: Path) -> None:
     """The same sensors' last minutes as a survey of their own, whose start lies after the jump."""
-    jump = {"type": "offset_step", "rms_nT": 3.0, "time_s": [300.0]}
+    jump = {"type": effect, "rms_nT": 3.0, "sensors": ["S2"]} | JUMPS[effect]
     whole = survey_file(tmp_path, scenario(5, jump, motion=scenario()["motion"] | {"duration_s": 600.0}))
     later = tmp_path / "later.h5"
     with h5py.File(whole) as old, h5py.File(later, "w") as new:
@@ -187,8 +196,8 @@ def test_a_jump_lasts_into_later_surveys(tmp_path: Path) -> None:
             new[name] = item[keep] if item.shape[:1] == keep.shape else item[()]
             if "units" in item.attrs:
                 new[name].attrs["units"] = item.attrs["units"]
-    found = magtensor.close_loop(whole, search=["offset_step"])
-    assert [a["error_model"] for a in found.verdict["adopted"]] == ["offset_step"]
+    found = magtensor.close_loop(whole, search=list(JUMPS))
+    assert [(a["error_model"], a["sensors"]) for a in found.verdict["adopted"]] == [(effect, ["S2"])]
     b = found.calibration.apply(later)["calibrated/b"].values
     contrast = b - b.mean(axis=1, keepdims=True)
     assert np.sqrt(np.mean(contrast**2)) < 1.3 * 0.15

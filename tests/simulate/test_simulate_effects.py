@@ -35,6 +35,8 @@ EVERY: dict[str, dict[str, Any]] = {
     "cross_field": {},
     "hysteresis": {"half_width_nT": [2000.0, 8000.0]},
     "offset_step": {"time_s": [20.0, 45.0]},
+    "scale_step": {"time_s": [20.0, 45.0]},
+    "turn_step": {"time_s": 20.0},
     "sampling_lag": {"per_axis": True},
     "eddy_current": {},
     "bandwidth": {},
@@ -391,6 +393,18 @@ def test_drift_warm_up_and_steps() -> None:
     np.testing.assert_allclose(settling[[0, 10], 0, 0], [8.0, 8.0 / np.e])
     jump, _ = added("offset_step", {"nT": [2.0, 0.0, 0.0], "time_s": [100.0, 200.0]}, motion=hour, rate_Hz=0.1)
     np.testing.assert_array_equal(jump[[9, 10, 19, 20, -1], 0, 0], [0, 2, 2, 4, 4])
+    gain, survey = added("scale_step", {"ppm": [50.0, 0.0, 0.0], "time_s": [100.0]}, motion=hour, rate_Hz=0.1)
+    assert not gain[:10].any()
+    np.testing.assert_allclose(gain[10:, :, 0], 5e-5 * survey.truth.b[10:, :, 0])
+    knock, survey = added("turn_step", {"arcmin": [0.0, 0.0, 60.0], "time_s": 100.0}, motion=hour, rate_Hz=0.1)
+    assert not knock[:10].any()
+    # the sensor turns by a degree about z, so that to it the field turns back
+    turned = survey.truth.b[10:] + knock[10:]
+    angle = np.degrees(np.arctan2(turned[..., 1], turned[..., 0])) - np.degrees(
+        np.arctan2(survey.truth.b[10:, :, 1], survey.truth.b[10:, :, 0])
+    )
+    np.testing.assert_allclose(angle, -1.0, atol=1e-6)
+    np.testing.assert_allclose(np.linalg.norm(turned, axis=2), np.linalg.norm(survey.truth.b[10:], axis=2))
 
 
 def test_unlogged_channels_act_but_are_not_written() -> None:

@@ -27,6 +27,7 @@ from magtensor.loop.log_noise import brought_in
 from magtensor.loop.model import Adopted, State, regressors
 from magtensor.loop.multiplicity import alike, effective_tests, projected
 from magtensor.loop.residual import Residual
+from magtensor.loop.separation import Assessed, lower_orders, lowest
 from magtensor.loop.settings import EventTimes, Range
 from magtensor.loop.terms import Terms, joined
 
@@ -134,18 +135,19 @@ def candidates_of(state: State, models: Sequence[Component], failed: dict[str, s
             scored.append(_Screened(model, settings, tried, white(terms), coloured(terms)))
     names = {s.model.name for s in scored}
     looked_at = _shortlist(scored, lambda s: s.white) + _shortlist(scored, lambda s: s.coloured)
-    assessed: dict[tuple[str, str], tuple[Adopted, float, Terms, Assessment]] = {}
+    assessed: dict[tuple[str, str], Assessed] = {}
     for each in looked_at:
-        settings = _refined(each.model, each.settings, state, failed)
-        key = each.model.name, str(settings)
-        if key in assessed:
-            continue
-        terms = _terms(each.model, settings, state.excitation, failed)
-        assert terms is not None
-        terms = terms.at(residual.samples)
-        assessment = assess(residual, terms, state.colours, state.terms)
-        assessed[key] = Adopted(each.model, settings), each.tried, terms, assessment
-    found = _one_each(list(assessed.values()))
+        refined = _refined(each.model, each.settings, state, failed)
+        for settings in (refined, *lower_orders(refined, profiled(each.model))):
+            key = each.model.name, str(settings)
+            if key in assessed:
+                continue
+            terms = _terms(each.model, settings, state.excitation, failed)
+            assert terms is not None
+            terms = terms.at(residual.samples)
+            assessment = assess(residual, terms, state.colours, state.terms)
+            assessed[key] = Adopted(each.model, settings), each.tried, terms, assessment
+    found = _one_each(state, list(assessed.values()))
     adjusted = _holm([a.p * tried for _, tried, _, a in found], len(names))
     null = _holm([a.null_p * tried for _, tried, _, a in found], len(names))
     candidates = [
@@ -231,16 +233,12 @@ def _shortlist(scored: Sequence[_Screened], score: Callable[[_Screened], float])
     return sorted(best.values(), key=score, reverse=True)[: SCREENED // 2]
 
 
-def _one_each(
-    assessed: Sequence[tuple[Adopted, float, Terms, Assessment]],
-) -> list[tuple[Adopted, float, Terms, Assessment]]:
-    """Of a model that was assessed with two settings, the one that predicts better."""
-    best: dict[str, tuple[Adopted, float, Terms, Assessment]] = {}
+def _one_each(state: State, assessed: Sequence[Assessed]) -> list[Assessed]:
+    """Of a model that was assessed with several settings, the one that predicts best, at the lowest order that does."""
+    named: dict[str, list[Assessed]] = {}
     for each in assessed:
-        name = each[0].name
-        if name not in best or each[3].gain.total > best[name][3].gain.total:
-            best[name] = each
-    return list(best.values())
+        named.setdefault(each[0].name, []).append(each)
+    return [lowest(state, several, profiled(several[0][0].component)) for several in named.values()]
 
 
 def _log_noise(state: State, model: Adopted) -> float:

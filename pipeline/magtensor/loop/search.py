@@ -16,20 +16,20 @@ import numpy as np
 from magtensor.calibration.types import Array
 from magtensor.components import Component
 from magtensor.errors import DataError
-from magtensor.loop.assessment import Colours, estimated, explained
+from magtensor.loop.assessment import estimated, explained
 from magtensor.loop.excitation import Excitation
 from magtensor.loop.latent import NAME, Sought, renewed, sought, tried_source
 from magtensor.loop.model import Adopted, Fitting, Record, State, joint_state
 from magtensor.loop.needs import missing
 from magtensor.loop.residual import Residual
 from magtensor.loop.screening import ALPHA, Candidate, Scorer, candidates_of, generic, golden, profiled, repeatable
+from magtensor.loop.separation import SEPARATION, fold_gain, separated
 from magtensor.loop.settings import Range
 from magtensor.loop.spectrum import spectral_lines
-from magtensor.loop.statistics import Gain, family_p, held_out_gain
-from magtensor.loop.terms import Terms, joined
+from magtensor.loop.statistics import family_p
+from magtensor.loop.terms import Terms
 from magtensor.loop.trial import Trial, trial
 
-SEPARATION = 9.0  # twice the log likelihood ratio between two models below which the data do not tell them apart
 KEEP_ALPHA = 0.01  # an adopted effect that is no longer significant at this level is dropped
 MOST_EFFECTS = 8
 POLISH = 0.1  # of a setting, to either side
@@ -239,8 +239,8 @@ def _containing(best: Candidate, possible: Sequence[Candidate], state: State) ->
     more = [c for c in possible if c.assessment.gain.total > best.assessment.gain.total + SEPARATION]
     for other in sorted(more, key=lambda c: -c.assessment.gain.total):
         colours = other.assessment.colours
-        alone = _fold_gain(state, colours, other.terms)
-        if _fold_gain(state, colours, other.terms, best.terms).total - alone.total < SEPARATION:
+        alone = fold_gain(state, colours, other.terms)
+        if fold_gain(state, colours, other.terms, best.terms).total - alone.total < SEPARATION:
             return other
     return best
 
@@ -251,15 +251,13 @@ def simplest(best: Candidate, possible: Sequence[Candidate], state: State) -> tu
     A model that slow noise could explain is named, and not chosen before one that it could not.
     """
     colours = best.assessment.colours
-    reference = _fold_gain(state, colours, best.terms)
+    reference = fold_gain(state, colours, best.terms)
     equal: list[Candidate] = [best]
     for other in possible:
         if other is best:
             continue
-        ahead = reference.over(_fold_gain(state, colours, other.terms))
-        # a coefficient that is not needed costs about one on blocks that it was not fitted to
         spare = max(other.assessment.estimate.rank - best.assessment.estimate.rank, 0)
-        if ahead.total < SEPARATION + spare or not ahead.consistent:
+        if not separated(reference, fold_gain(state, colours, other.terms), spare):
             equal.append(other)
     chosen = min(
         (c for c in equal if c is best or c.passes),
@@ -268,29 +266,17 @@ def simplest(best: Candidate, possible: Sequence[Candidate], state: State) -> tu
     return chosen, tuple(sorted({c.model.name for c in equal if c is not chosen} - {chosen.model.name}))
 
 
-def _fold_gain(state: State, colours: Colours, *terms: Terms) -> Gain:
-    """What terms gain on held-out folds in noise of given colours, those of the adopted models free."""
-    from magtensor.loop.assessment import block_count
-    from magtensor.loop.evidence import grams
-
-    given = [] if state.terms is None else [state.terms]
-    together = joined([*given, *terms])
-    blocked = np.arange(together.count) < sum(t.count for t in given)
-    count = block_count(len(state.residual.affine))
-    blocks = grams(state.residual, together, colours.across, colours.along, count)
-    return held_out_gain(blocks, state.residual.freedom, blocked)
-
-
 def adopt(record: Record, state: State, chosen: Candidate, how: Fitting) -> State:
     """Refit with the chosen model, first on all sensors, then on those that show it."""
     # what it found of the others too: begun from zero, a strong slow effect would pass for the colour of the noise
     moves = np.split(chosen.assessment.theta, np.cumsum([len(t) for t in state.theta]))
     start = [t + move for t, move in zip([*state.theta, np.zeros(chosen.terms.count)], moves, strict=True)]
     after = joint_state(record, [*state.adopted, chosen.model], how, start)
-    sensors = _sensors_showing(after, len(state.adopted))
-    if sensors is None or not _spare(after, len(state.adopted), sensors):
-        return after
-    return _narrowed(record, after, len(state.adopted), sensors, how)
+    which = len(state.adopted)
+    sensors = _sensors_showing(after, which)
+    if sensors is None or not _spare(after, which, sensors):
+        sensors = _sufficient(after, which)
+    return after if sensors is None else _narrowed(record, after, which, sensors, how)
 
 
 def _narrowed(record: Record, state: State, which: int, sensors: tuple[str, ...], how: Fitting) -> State:
@@ -314,15 +300,38 @@ def _spare(state: State, which: int, sensors: tuple[str, ...]) -> bool:
     """
     from scipy.stats import chi2
 
+    gone, seen, lost = _without_others(state, which, sensors)
+    return seen == gone and lost < float(chi2.isf(KEEP_ALPHA, gone))
+
+
+def _sufficient(state: State, which: int) -> tuple[str, ...] | None:
+    """The one sensor whose coefficients explain all that a model does, where others can stand in for them.
+
+    If only differences between sensors are seen, one that turned is like all others turned the other way: every
+    coefficient is significant, or none is. None where no sensor suffices, or several do.
+    """
+    from scipy.stats import chi2
+
+    assert state.terms is not None
+    owners = state.terms.sensors[_slices(state)[which]]
+    found = []
+    for sensor in sorted(set(owners) - {""}):
+        gone, seen, lost = _without_others(state, which, (sensor,))
+        if 0 < seen < gone and lost < float(chi2.isf(KEEP_ALPHA, seen)):
+            found.append(sensor)
+    return tuple(found) if len(found) == 1 else None
+
+
+def _without_others(state: State, which: int, sensors: tuple[str, ...]) -> tuple[int, int, float]:
+    """Of a model's coefficients for all but some sensors: how many, how many directions of them the survey shows, and
+    what is explained no longer without them."""
     assert state.terms is not None
     part = _slices(state)[which]
     kept = [i for i, s in enumerate(state.terms.sensors) if not part.start <= i < part.stop or s in sensors or s == ""]
     back = put_back(state.residual, state.terms, np.concatenate(state.theta))
     every = estimated(back, state.terms, state.colours)
     fewer = estimated(back, state.terms.only(kept), state.colours)
-    gone = state.terms.count - len(kept)
-    lost = explained(every) - explained(fewer)
-    return every.rank - fewer.rank == gone and lost < float(chi2.isf(KEEP_ALPHA, gone))
+    return state.terms.count - len(kept), every.rank - fewer.rank, explained(every) - explained(fewer)
 
 
 def _polished(record: Record, state: State, how: Fitting) -> State:

@@ -122,6 +122,14 @@ class Choice:
 
 
 @dataclass(frozen=True)
+class Orders(Choice):
+    """Numbers of which a higher one keeps all coefficients of a lower one and adds some.
+
+    The lowest is chosen that held-out blocks do not separate from the best.
+    """
+
+
+@dataclass(frozen=True)
 class EventTimes:
     """Times at which something may have happened, at a spacing, away from both ends, s after the start.
 

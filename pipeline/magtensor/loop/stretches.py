@@ -2,6 +2,9 @@
 
 A strong effect that lasts (warming up, a thermoelectric current at switch-on) lies beyond all noise while it does.
 Left out as disturbed it would take the evidence for itself along. A spike stands alone.
+
+What differs from posture to posture (a gain that has jumped) has no neighbours like itself. It is no disturbance where
+it lasts longer than a held-out fold: other folds can confirm it then.
 """
 
 from __future__ import annotations
@@ -14,12 +17,14 @@ from magtensor.calibration.joint import JointFit
 from magtensor.calibration.joint_together import FALSE_REJECTION
 from magtensor.calibration.types import Array, Mask
 from magtensor.loop.residual import residual_of
+from magtensor.loop.statistics import FOLDS
 
 NEIGHBOURS = 5  # samples of a running median: what lasts for three of them is no spike
 
 
 def borne_out(fit: JointFit, raw: Array, total_field: Array, reference_noise: float = 0.0) -> Mask:
-    """(N,) the samples of a fit, and those it doubts that depart from their neighbours by no more than noise.
+    """(N,) the samples of a fit, and those it doubts that depart from their neighbours by no more than noise or lie in
+    a stretch longer than a fold.
 
     Parameters
     ----------
@@ -40,4 +45,9 @@ def borne_out(fit: JointFit, raw: Array, total_field: Array, reference_noise: fl
         good &= square <= limit * np.median(square)
     out = np.array(fit.keep)
     out[doubted] = good[doubted]
+    doubtful = median_filter((~fit.keep).astype(int), size=NEIGHBOURS, mode="nearest")
+    edges = np.flatnonzero(np.diff(doubtful, prepend=0, append=0)).reshape(-1, 2)
+    for first, end in edges:
+        if end - first > len(raw) / FOLDS:
+            out[first:end] = True
     return out

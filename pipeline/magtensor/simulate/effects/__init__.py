@@ -8,6 +8,7 @@ from magtensor.simulate.effects.electronics import (
     OffsetDrift,
     OffsetStep,
     ScaleDrift,
+    ScaleStep,
     SupplyOffset,
     SupplyScale,
     TemperatureOffset,
@@ -25,6 +26,7 @@ from magtensor.simulate.effects.platform import (
     LatentSource,
     MovingPart,
     PeriodicInterference,
+    TurnStep,
     ViscousMagnetisation,
 )
 from magtensor.simulate.effects.reference import ReferenceClock, ReferenceScale, ReferenceStep
@@ -46,6 +48,8 @@ AnyEffect = Annotated[
     | ScaleDrift
     | WarmUp
     | OffsetStep
+    | ScaleStep
+    | TurnStep
     | SupplyScale
     | SupplyOffset
     | CurrentField

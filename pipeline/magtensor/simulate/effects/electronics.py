@@ -146,6 +146,19 @@ class OffsetStep(SensorEffectSpec):
         return jumps[:, None, None] * coefficients
 
 
+class ScaleStep(SensorEffectSpec):
+    """The scale factors jump: a feedback path, a range or a reference voltage is not what it was."""
+
+    COEFFICIENTS = "ppm"
+    type: Literal["scale_step"]
+    ppm: PerSensor | None = Field(None, description="x, y, z of each jump, for all sensors or for each")
+    time_s: list[float] = Field(min_length=1, description="times of the jumps, s since the start")
+
+    def waveform(self, bench: Bench, coefficients: Array) -> Array:
+        jumps = np.sum([bench.time >= at for at in self.time_s], axis=0)
+        return bench.sensed(bench.b) * (1e-6 * coefficients) * jumps[:, None, None]
+
+
 class FromSupply(SensorEffectSpec):
     """What follows the supply voltage."""
 

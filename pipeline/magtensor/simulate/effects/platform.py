@@ -250,6 +250,24 @@ class FrameFlexure(SensorEffectSpec):
         return bench.sensed(turned)
 
 
+class TurnStep(SensorEffectSpec):
+    """A sensor is knocked and turns in its mount."""
+
+    COEFFICIENTS = "arcmin"
+    LINEAR = False
+    type: Literal["turn_step"]
+    arcmin: PerSensor | None = Field(
+        None, description="rotation vector in the platform frame, x, y, z, for all sensors or for each"
+    )
+    time_s: float = Field(description="time of the knock, s since the start")
+
+    def waveform(self, bench: Bench, coefficients: Array) -> Array:
+        after = bench.time >= self.time_s
+        turned = np.zeros(bench.b.shape)
+        turned[after] = transform_back(matrices(exponential(ARCMIN * coefficients)), bench.b[after]) - bench.b[after]
+        return bench.sensed(turned)
+
+
 def _matrices(given: object, sensors: int, what: str) -> Array:
     array = np.asarray(given, dtype=float)
     if len(array) not in (1, sensors):

@@ -1,0 +1,70 @@
+"""Jumps that most of a survey's samples feel, and powers of a channel that only together predict."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from loop_cases import linear_state, loaded, scenario, synthetic
+
+from magtensor.loop.model import Fitting
+from magtensor.loop.search import Search, search
+from magtensor.registry import Registry
+
+SAMPLES = 300
+
+
+def searched(record: Any, *names: str) -> Search:
+    registry = Registry.load()
+    return search(record, [registry.find("error_model", n) for n in names], Fitting())
+
+
+def gain_jump(first: int, end: int) -> Any:
+    """A gain of S2's y axis that is 1000 ppm more for some samples, at random attitudes: up to 50 nT."""
+    # the same draw as in `synthetic`, whose field it is
+    u = np.random.default_rng(3).standard_normal((SAMPLES, 3))
+    added = np.zeros((SAMPLES, 4, 3))
+    along = u[:, 1] / np.linalg.norm(u, axis=1) * 50_000.0
+    added[first:end, 1, 1] = 1e-3 * along[first:end]
+    return synthetic(3, SAMPLES, noise_nT=0.3, added=added)
+
+
+def test_a_jump_that_lasts_is_no_disturbance_whatever_the_attitudes() -> None:
+    record = gain_jump(200, SAMPLES)
+    assert linear_state(record).fit.keep.all()
+    found = searched(record, "offset_step", "scale_step", "turn_step")
+    (adopted,) = found.last.adopted
+    assert (adopted.name, adopted.sensors) == ("scale_step", ("S2",))
+    assert 199 < adopted.settings["time_s"] <= 200
+    np.testing.assert_allclose(found.last.theta[0][1], 1000.0, atol=5.0)
+    assert found.last.fit.keep.all()
+
+
+def test_what_is_over_within_a_fold_is_a_disturbance() -> None:
+    state = linear_state(gain_jump(200, 225))
+    doubted = np.flatnonzero(~state.fit.keep)
+    assert len(doubted) > 10  # at the other attitudes the axis is across the field and shows little
+    assert doubted.min() >= 200 and doubted.max() < 225
+
+
+BEND = {"type": "channel_response", "channel": "temperature", "power": 2, "lag_s": 100.0}
+LINE = {"type": "temperature_offset", "lag_s": 100.0}
+
+
+@pytest.mark.parametrize(
+    ("effects", "order"),
+    [
+        ([LINE | {"rms_nT": 0.5}], 1),
+        ([BEND | {"rms_nT": 0.5}], 2),
+        ([LINE | {"rms_nT": 0.4}, BEND | {"rms_nT": 0.4}], 2),
+    ],
+    ids=["line", "bend", "both"],
+)
+def test_the_order_of_a_temperature_is_the_lowest_that_does(
+    effects: list[dict[str, Any]], order: int, tmp_path: Path
+) -> None:
+    found = searched(loaded(tmp_path, scenario(4, *effects)), "temperature_offset", "temperature_scale", "offset_drift")
+    (adopted,) = found.last.adopted
+    assert (adopted.name, adopted.settings["order"]) == ("temperature_offset", order)
