@@ -15,7 +15,7 @@ import numpy as np
 
 from magtensor.calibrated import MATRIX_ENTRIES, OFFSET_ENTRIES
 from magtensor.calibration.joint import calibrated, nearest_frame
-from magtensor.calibration.joint_covariance import frame_projection
+from magtensor.calibration.joint_covariance import frame_projection, to_corrections
 from magtensor.calibration.types import Array, ArrayCalibration
 from magtensor.loop.correction import TONE
 from magtensor.loop.model import Adopted, State
@@ -90,11 +90,9 @@ def _slope(state: State) -> Array:
         change *= residual.noise[:, None]
         response = change[:, :3].reshape(sensors, 3, 3) @ q / unit
         moved[:, k] = np.concatenate([response.reshape(sensors, 9), change[:, 3].reshape(sensors, 3)], axis=1).ravel()
-    moved = frame_projection(forward) @ moved
-    matrix = np.linalg.inv(forward)
-    for s, m in enumerate(matrix):
-        moved[12 * s : 12 * s + 9] = -np.kron(m, m.T) @ moved[12 * s : 12 * s + 9]
-    return moved
+    matrix = np.asarray(np.linalg.inv(forward), dtype=np.float64)
+    out: Array = to_corrections(matrix) @ frame_projection(forward) @ moved
+    return out
 
 
 def coefficient_variables(found: WithCoefficients, sensors: Sequence[str]) -> dict[str, Variable]:

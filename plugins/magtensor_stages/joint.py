@@ -234,7 +234,7 @@ def _with_error_models(
 ) -> dict[str, Any]:
     """The variables of a survey whose outputs and total field hold declared effects."""
     from magtensor.effect_errors import coefficient_variables, with_coefficients
-    from magtensor.loop.model import Adopted, Fitting, joint_state, require_determined
+    from magtensor.loop.model import Adopted, Fitting, joint_state, require_determined, with_colour
     from magtensor.loop.needs import missing
     from magtensor.loop.record import record_of
     from magtensor.loop.stored import cleaned, effect_variables
@@ -251,7 +251,7 @@ def _with_error_models(
     with naming(survey):
         state = joint_state(record, adopted, how, keep=None if robust else np.ones(len(record.time), dtype=bool))
         require_determined(record, state, how)
-    found = with_coefficients(state)
+    found = with_coefficients(with_colour(record, state, how))
     calibration = found.calibration
     clean = cleaned(survey, calibration, adopted, state.theta, record.means)
     given = common_frame(clean, calibration, "joint") | effect_variables(adopted, state.theta, record.means, survey)

@@ -72,7 +72,7 @@ def close_loop(
     from magtensor.loop.decisions import Decision, decision_of
     from magtensor.loop.errors_before_after import held_out_error
     from magtensor.loop.inquiry import inquiry_of
-    from magtensor.loop.model import Fitting
+    from magtensor.loop.model import Fitting, with_colour
     from magtensor.loop.near_nominal import doubt_of, labelled, settled
     from magtensor.loop.stored import cleaned, effect_variables
     from magtensor.loop.unexplained import unexplained
@@ -104,7 +104,7 @@ def close_loop(
     seen = as_elsewhere(looked_at, calibrated(found.last.fit), found.last)
     after = before if same else held_out_error(seen, found.last.adopted, how, found.last.theta, keep)
     found = inquiry.on_every_sample(found)
-    first, last, record = found.first, found.last, found.record
+    first, last, record = found.first, with_colour(found.record, found.last, how), found.record
     calibration, errors = calibrated(last.fit), {}
     if last.adopted and last.fit.posterior is None:
         together = with_coefficients(last)

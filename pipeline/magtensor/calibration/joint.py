@@ -13,7 +13,7 @@ tells the noise, and finished in one reading of the whole (`whole_record`): memo
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -22,13 +22,15 @@ from magtensor.errors import DataError, NotEnoughData
 
 from .agreement import require_agreement
 from .axes import mirrored_words, turned_words
+from .blocks import Blocks, blocks_of
 from .common_field import CommonField
 from .coverage import WORST_ERROR, Coverage, coverage, require_coverage
-from .joint_covariance import forward_covariance
+from .joint_covariance import forward_covariance, to_corrections
 from .joint_together import Together, fit_together, limits_of, unfolded
 from .maximum_likelihood import ScalarFit
 from .noise import noise_std
 from .recording import InMemory, Recording, even_blocks, selected
+from .score_colour import ScoreColour, colour_of_scores
 from .types import Array, ArrayCalibration, Mask
 from .whole_record import fit_whole
 
@@ -62,6 +64,7 @@ class JointFit:
         plane: the common field; scalar: the calibration within its plane.
         keep: (N,) samples that were used.
         coverage: what their attitudes can determine, judged in the frame of `nearest_frame`.
+        colour: of the scores; None where the noise passes for white, or was not asked for (`fit_recording`).
         posterior: of a fit that leans on a prior; None where the attitudes alone determine it.
     """
 
@@ -71,6 +74,7 @@ class JointFit:
     scalar: ScalarFit
     keep: Mask
     coverage: Coverage
+    colour: ScoreColour | None = None
     posterior: Posterior | None = None
 
 
@@ -101,8 +105,9 @@ def fit_recording(
     robust: leave out samples that no noise explains.
     worst_error: see `coverage.coverage`.
     keep: (N,) the samples to believe; judged here when None.
-    complete: the model is believed to hold all there is, so that a misfit is noise. Where it is not, an effect that no
-        one has added yet must not pass for a lack of attitudes.
+    complete: the model is believed to hold all there is, so that a misfit is noise, whose colour is then found
+        (later: `with_colour`). Where it is not, an effect that no one has added yet must not pass for a lack of
+        attitudes.
 
     Raises
     ------
@@ -126,12 +131,14 @@ def fit_recording(
                 used = np.zeros(recording.count, dtype=bool)
                 used[chosen] = begun.keep
                 raw, total_field = part.raw[begun.keep], part.total_field[begun.keep]
-                return _accepted(begun.plane, begun.scalar, used, raw, total_field, worst_error, level)
+                found = _accepted(begun.plane, begun.scalar, used, raw, total_field, worst_error, level)
+                return with_colour(found, raw, total_field, reference_noise) if complete else found
             limits = limits_of(begun, part, reference_noise, count) if judge else None
             whole = fit_whole(
                 recording, begun.plane, begun.scalar, limits=limits, reference_noise=reference_noise, keep=allowed
             )
-            return _accepted(whole.plane, whole.scalar, whole.keep, whole.raw, whole.total_field, worst_error, level)
+            found = _accepted(whole.plane, whole.scalar, whole.keep, whole.raw, whole.total_field, worst_error, level)
+            return _coloured(found, whole.blocks) if complete else found
         except NotEnoughData:
             # what a selection lacks, the rest may hold
             if len(chosen) == count or samples >= LARGEST_SELECTION:
@@ -167,6 +174,18 @@ def _accepted(
     return JointFit(forward, offset, plane, scalar, keep, found)
 
 
+def with_colour(fit: JointFit, raw: Array, total_field: Array, reference_noise: float = 0.0) -> JointFit:
+    """The fit with the colour of its noise, from the samples raw (n, S, 3), total_field (n,) that it used."""
+    if fit.posterior is not None:
+        return fit
+    return _coloured(fit, blocks_of(fit.plane, fit.scalar, raw, total_field, reference_noise))
+
+
+def _coloured(fit: JointFit, blocks: Blocks) -> JointFit:
+    found = colour_of_scores(blocks.at(fit.plane, fit.scalar), fit.plane.chi2, fit.scalar.chi2)
+    return replace(fit, colour=found)
+
+
 def _level(part: Together, plane: CommonField, scalar: ScalarFit, keep: Mask) -> float:
     """nT, the noise of the calibrated field at the highest frequencies."""
     field = scalar.field(plane.coordinates(part.raw[keep]))
@@ -196,36 +215,50 @@ def nearest_frame(forward: Array) -> Array:
     return q
 
 
+def diagnostics(
+    keep: Mask, chi2_along: float, plane: CommonField, found: Coverage, matrix: Array
+) -> dict[str, float | str]:
+    """What every joint fit reports; chi2_along: mean square of the whitened residuals along the field."""
+    return {
+        "samples": float(keep.sum()),
+        "rejected": float((~keep).sum()),
+        "chi2_total_field": chi2_along,
+        "chi2_contrasts": plane.chi2,
+        "noise_nT": float(np.sqrt(np.mean(plane.noise**2))),
+        "condition_number": found.condition_number,
+        "missing_attitudes": found.missing,
+        "further_postures": str(found.further),
+        "axes": "; ".join(turned_words(matrix)),
+    }
+
+
+def widening(covariance: Array, white: Array) -> dict[str, float | str]:
+    """By how much noise that is not white widened the standard deviations, rms over the elements of all sensors."""
+    ratio = (np.diag(covariance) / np.diag(white)).reshape(-1, 12)
+    return {
+        "widened_offsets": float(np.sqrt(ratio[:, 9:].mean())),
+        "widened_matrices": float(np.sqrt(ratio[:, :9].mean())),
+    }
+
+
 def calibrated(fit: JointFit) -> ArrayCalibration:
     """The fit as corrections in the frame nearest to the raw axes, with the covariance of all 12 S parameters."""
     q = nearest_frame(fit.forward)
     forward = fit.forward @ q
-    if fit.posterior is None:
-        covariance = forward_covariance(fit.plane, fit.scalar, forward, q)
-    else:
-        covariance = fit.posterior.covariance
     matrix = np.asarray(np.linalg.inv(forward), dtype=np.float64)
-    size = 12 * len(forward)
-    to_matrix = np.zeros((size, size))
-    for s, m in enumerate(matrix):
-        block = slice(12 * s, 12 * s + 9)
-        to_matrix[block, block] = -np.kron(m, m.T)
-        to_matrix[12 * s + 9 : 12 * s + 12, 12 * s + 9 : 12 * s + 12] = np.eye(3)
+    chain = to_corrections(matrix)
+    if fit.posterior is None:
+        covariance = chain @ forward_covariance(fit.plane, fit.scalar, forward, q, fit.colour) @ chain.T
+    else:
+        covariance = chain @ fit.posterior.covariance @ chain.T
+    told = diagnostics(fit.keep, fit.scalar.chi2, fit.plane, fit.coverage, matrix)
+    if fit.colour is not None:
+        told |= widening(covariance, chain @ forward_covariance(fit.plane, fit.scalar, forward, q) @ chain.T)
     return ArrayCalibration(
         matrix,
         fit.offset,
-        to_matrix @ covariance @ to_matrix.T,
+        covariance,
         "array (nearest to the raw axes)",
         ("one rotation of the whole array: the frame nearest to the raw axes was chosen",),
-        {
-            "samples": float(fit.keep.sum()),
-            "rejected": float((~fit.keep).sum()),
-            "chi2_total_field": fit.scalar.chi2,
-            "chi2_contrasts": fit.plane.chi2,
-            "noise_nT": float(np.sqrt(np.mean(fit.plane.noise**2))),
-            "condition_number": fit.coverage.condition_number,
-            "missing_attitudes": fit.coverage.missing,
-            "further_postures": str(fit.coverage.further),
-            "axes": "; ".join(turned_words(matrix)),
-        },
+        told,
     )

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import numpy as np
 
+from .blocks import complement
 from .common_field import CommonField
 from .maximum_likelihood import ScalarFit
+from .score_colour import ScoreColour, whitening
 from .types import Array
 
 SYMMETRIC = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))  # the order of the scalar fit's parameters
 
 
-def forward_covariance(plane: CommonField, scalar: ScalarFit, forward: Array, q: Array) -> Array:
+def forward_covariance(
+    plane: CommonField, scalar: ScalarFit, forward: Array, q: Array, colour: ScoreColour | None = None
+) -> Array:
     """Covariance (12 S, 12 S) of C Q (row by row) and o of each sensor, in the frame of `nearest_frame`.
 
     In whitened outputs a change W (3 S, 4) of [C | o] moves a sample by W z, z = (b, 1). Perpendicular to the
@@ -22,30 +26,26 @@ def forward_covariance(plane: CommonField, scalar: ScalarFit, forward: Array, q:
     Parameters
     ----------
     forward: (S, 3, 3) C Q; q: (3, 3) Q.
+    colour: of the scores; white noise when None.
     """
-    sensors, size = len(forward), 3 * len(forward)
+    sensors = len(forward)
     turn = np.eye(4)
     turn[:3, :3] = q
-    moments = turn.T @ scalar.scores.moments @ turn
-    inverse_moments = np.linalg.inv(moments)
+    white = whitening(scalar.scores.moments, scalar.scores.normal)
     # within the plane: parameters A = V' W (3, 4), row by row, change the field by U A (Q' b, 1)
     to_field = np.zeros((9, 3, 4))
     for k, (i, j) in enumerate(SYMMETRIC):
         to_field[k, :, :3] = (np.outer(scalar.matrix[i], q[j]) + np.outer(scalar.matrix[j], q[i])) / 2
     to_field[6:, :, 3] = scalar.matrix
-    rows = to_field.reshape(9, 12)
-    inner = rows.T @ scalar.scores.normal @ rows
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(inner), 1e-300))
-    values, vectors = np.linalg.eigh(inner * np.outer(scale, scale))
-    seen = values > values[-1] * 1e-12
-    root = (vectors[:, seen] / np.sqrt(values[seen])) * scale[:, None]
-    inside = root @ root.T * max(scalar.chi2, 1.0)
-    v = plane.basis
-    outside = np.eye(size) - v @ v.T
-    spread_in = np.kron(v, np.eye(4))
-    whitened = np.kron(outside, inverse_moments) + spread_in @ inside @ spread_in.T
-    d = np.kron(np.diag(plane.noise), np.eye(4))
-    covariance = d @ whitened @ d  # rows of W: output after output, [C | o] along them
+    inside = np.kron(plane.basis, np.eye(4)) @ np.linalg.pinv(to_field.reshape(9, 12)) @ white.along
+    outside = np.kron(complement(plane), turn.T @ white.across)
+    # rows of W: output after output, [C | o] along them
+    moved = np.concatenate([outside, inside], axis=1) * np.repeat(plane.noise, 4)[:, None]
+    if colour is None:
+        moved[:, -9:] *= np.sqrt(max(scalar.chi2, 1.0))
+        covariance = moved @ moved.T
+    else:
+        covariance = moved @ colour.covariance @ moved.T
     pick = []
     for s in range(sensors):
         pick += [4 * (3 * s + i) + j for i in range(3) for j in range(3)]
@@ -53,6 +53,20 @@ def forward_covariance(plane: CommonField, scalar: ScalarFit, forward: Array, q:
     covariance = covariance[np.ix_(pick, pick)]
     fixing = frame_projection(forward)
     out: Array = fixing @ covariance @ fixing.T
+    return out
+
+
+def to_corrections(matrix: Array) -> Array:
+    """(12 S, 12 S): derivative of the corrections' elements and offsets with C (row by row) and o of each sensor.
+
+    Parameters
+    ----------
+    matrix: (S, 3, 3), C^-1.
+    """
+    out = np.eye(12 * len(matrix))
+    for s, m in enumerate(matrix):
+        block = slice(12 * s, 12 * s + 9)
+        out[block, block] = -np.kron(m, m.T)
     return out
 
 

@@ -13,8 +13,9 @@ factor of the ellipsoid's matrix is preferred; in order E_xx, E_yy, E_zz, E_yz, 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Protocol
 
 import numpy as np
@@ -29,6 +30,7 @@ START_SAMPLES = (4_000, 20_000)  # the algebraic fit is only where the iteration
 CHUNK = 8192  # samples worked on at a time: their columns stay in the processor's cache
 PAIRS = ((1, 2), (0, 2), (0, 1))
 WEIGHTS = np.array([1.0, 1, 1, 2, 2, 2, 1, 1, 1])  # an off-diagonal element of E counts twice
+_TWICE = np.outer(WEIGHTS, WEIGHTS)
 
 
 @dataclass(frozen=True)
@@ -142,6 +144,11 @@ def along(matrix: Array, offset: Array, y: Array, total_field: Array, reference_
 
 def scores(seen: Along, total_field: Array) -> Scores:
     """The sums of samples seen along the field, total_field (n,) nT."""
+    return scores_of_blocks(seen, total_field, (0, len(total_field)))[0]
+
+
+def scores_of_blocks(seen: Along, total_field: Array, edges: Sequence[int]) -> list[Scores]:
+    """The sums of samples seen along the field, total_field (n,) nT, from each edge to the next."""
     u, h, r = seen.unit, seen.turned, seen.residual
     m = r * seen.inverse_std
     m2 = m * m
@@ -150,26 +157,31 @@ def scores(seen: Along, total_field: Array) -> Scores:
     toward = (m * seen.length + shrink) * u
     m2 += m2
     toward -= m2 * h
-    change = [float(toward[i] @ u[i]) for i in range(3)]
-    change += [float(toward[i] @ u[j] + toward[j] @ u[i]) for i, j in PAIRS]
     shrink /= seen.length
     shrink += m
     m2 /= 2.0 * seen.length
-    shift = u @ shrink - h @ m2
     rows = np.empty((9, len(r)))
     scaled = np.multiply(u, seen.inverse_std, out=rows[6:])
     foot = u * total_field
     np.multiply(scaled, foot, out=rows[:3])
     for k, (i, j) in enumerate(PAIRS):
         np.multiply(scaled[i], foot[j], out=rows[3 + k])
-    normal = rows @ rows.T * np.outer(WEIGHTS, WEIGHTS)
-    moments = np.empty((4, 4))
-    for i in range(3):
-        for j in range(i + 1):
-            moments[i, j] = moments[j, i] = foot[i] @ foot[j]
-        moments[i, 3] = moments[3, i] = foot[i].sum()
-    moments[3, 3] = len(r)
-    return Scores(len(r), float(r @ r), np.array([*change, *shift]), normal, moments)
+    found = []
+    for start, stop in pairwise(edges):
+        part = slice(start, stop)
+        t, v, foot_, own = toward[:, part], u[:, part], foot[:, part], rows[:, part]
+        change = [float(t[i] @ v[i]) for i in range(3)]
+        change += [float(t[i] @ v[j] + t[j] @ v[i]) for i, j in PAIRS]
+        shift = v @ shrink[part] - h[:, part] @ m2[part]
+        moments = np.empty((4, 4))
+        for i in range(3):
+            for j in range(i + 1):
+                moments[i, j] = moments[j, i] = foot_[i] @ foot_[j]
+            moments[i, 3] = moments[3, i] = foot_[i].sum()
+        moments[3, 3] = stop - start
+        cost = float(r[part] @ r[part])
+        found.append(Scores(int(stop - start), cost, np.array([*change, *shift]), own @ own.T * _TWICE, moments))
+    return found
 
 
 def fit_scalar(y: Array, total_field: Array, reference_noise: float = 0.0, complete: bool = True) -> ScalarFit:

@@ -351,7 +351,7 @@ def _found(
     to_frame = frame_projection(forward @ q) @ _ordered(sensors, q, data.unit)
     covariance = to_frame @ covariance @ to_frame.T
     prior = to_frame @ np.diag(std**2) @ to_frame.T
-    return JointFit(forward, offset, plane, scalar, believed, seen, Posterior(covariance, prior, field))
+    return JointFit(forward, offset, plane, scalar, believed, seen, posterior=Posterior(covariance, prior, field))
 
 
 def _ordered(sensors: int, q: Array, unit: float) -> Array:

@@ -10,14 +10,15 @@ again. Samples that no noise explains are left out on the way.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from magtensor.errors import DataError, NotEnoughData
 
+from .blocks import Blocks, length_of
 from .common_field import CommonField
-from .maximum_likelihood import CHUNK, NOTHING, Along, ScalarFit, Scores, along, scores, scoring_step, stepped
+from .maximum_likelihood import CHUNK, Along, ScalarFit, along, scoring_step, stepped
 from .recording import Recording, even_samples, pieces
 from .types import Array, Mask
 
@@ -41,6 +42,7 @@ class Whole:
     Attributes:
         keep: (N,) samples used; doubted among the usable are those left out.
         raw, total_field: the samples picked for judging the attitudes, all of them used.
+        blocks: sums over blocks of samples.
     """
 
     plane: CommonField
@@ -48,6 +50,7 @@ class Whole:
     keep: Mask
     raw: Array
     total_field: Array
+    blocks: Blocks
 
 
 def fit_whole(
@@ -72,13 +75,11 @@ def fit_whole(
     DataError: a value that is not finite.
     """
     for _ in range(_MOST_READINGS):
-        sums = _Sums.of(plane)
+        sums = Blocks.of(plane)
         read = _read(recording, plane, scalar, limits, reference_noise, keep, sums)
-        if not np.isfinite(sums.scores.cost + sums.total.sum()):
-            raise DataError("the samples are not all finite", hint="mask the gaps before calibrating")
-        plane, scalar, left = sums.solved(plane, scalar)
+        plane, scalar, left = _solved(sums, plane, scalar)
         if left < NEGLIGIBLE:
-            return Whole(plane, scalar, *read)
+            return Whole(plane, scalar, *read, sums)
     raise NotEnoughData(
         "the fit of the whole recording does not settle", hint="look for disturbed samples, or add attitudes"
     )
@@ -91,7 +92,7 @@ def _read(
     limits: Limits | None,
     reference_noise: float,
     keep: Mask | None,
-    sums: _Sums,
+    sums: Blocks,
 ) -> tuple[Mask, Array, Array]:
     """One reading: the sums are filled; which samples were used, and those picked."""
     used = np.ones(recording.count, dtype=bool) if keep is None else keep.copy()
@@ -99,6 +100,7 @@ def _read(
     picked = even_samples(recording.count, PICKED)
     picks: list[tuple[Array, Array]] = []
     offset = scalar.offset - sums.centre[:3]
+    length = length_of(recording.count)
     for where, raw, total_field in pieces(recording):
         flat = raw.reshape(len(raw), -1)
         for start in range(0, len(raw), CHUNK):
@@ -117,7 +119,10 @@ def _read(
                     here[here] = good
                     z, reference = z[:, good], reference[good]
                     seen = along(scalar.matrix, offset, z[:3], reference, reference_noise)
-            sums.add(z, seen, reference)
+            edges = [*range(0, len(here), length), len(here)]
+            if len(reference) < len(here):
+                edges = np.append(0, np.cumsum(here))[edges].tolist()
+            sums.add((where.start + start) // length, edges, z, seen, reference)
         own = picked[np.searchsorted(picked, where.start) : np.searchsorted(picked, where.stop)]
         own = own[used[own]] - where.start
         picks.append((raw[own], total_field[own]))
@@ -136,66 +141,42 @@ def _believed(seen: Along, z: Array, limits: Limits) -> Mask:
     return good
 
 
-@dataclass
-class _Sums:
-    """Sums over samples in whitened outputs turned so that the first three are the plane's coordinates.
+def _solved(sums: Blocks, plane: CommonField, scalar: ScalarFit) -> tuple[CommonField, ScalarFit, float]:
+    """The plane and the calibration in it that these sums ask for, and a bound, in standard deviations, of what
+    is left to go (5 to 100 times what a further reading finds).
 
-    Attributes:
-        axes: (3 S, 3 S), orthonormal columns, the plane's three first.
-        turn: (3 S, 3 S) from raw outputs; centre: (3 S,) the plane's mean, turned.
+    Raises
+    ------
+    DataError: a value that is not finite.
     """
-
-    axes: Array
-    turn: Array
-    centre: Array
-    total: Array
-    square: Array
-    scores: Scores = field(default=NOTHING)
-
-    @classmethod
-    def of(cls, plane: CommonField) -> _Sums:
-        axes = np.linalg.qr(plane.basis, mode="complete")[0]
-        axes[:, :3] = plane.basis
-        size = len(axes)
-        return cls(axes, (axes / plane.noise[:, None]).T, axes.T @ plane.mean, np.zeros(size), np.zeros((size, size)))
-
-    def add(self, z: Array, seen: Along, total_field: Array) -> None:
-        """Samples z (3 S, n), centred."""
-        if len(z) > 3:  # a single sensor's plane is all there is
-            self.total += z.sum(axis=1)
-            self.square += z @ z.T
-        self.scores += scores(seen, total_field)
-
-    def solved(self, plane: CommonField, scalar: ScalarFit) -> tuple[CommonField, ScalarFit, float]:
-        """The plane and the calibration in it that these sums ask for, and a bound, in standard deviations, of what
-        is left to go (5 to 100 times what a further reading finds)."""
-        count, size = self.scores.samples, len(self.axes)
-        mean = self.total / count
-        moments = self.square / count - np.outer(mean, mean)
-        step, expected = scoring_step(self.scores)
-        matrix, offset = stepped(scalar.matrix, scalar.offset - self.centre[:3], step)
-        after = Scores(
-            count, max(self.scores.cost - expected, 0.0), np.zeros(9), self.scores.normal, self.scores.moments
-        )
-        reach = np.sqrt(np.mean(np.diag(after.moments)[:3] * 3.0) / count)
-        relative = max(np.abs(step[:6]).max(), np.abs(step[6:]).max() / reach)
-        noise_share = np.sqrt(self.scores.cost / np.trace(after.normal[6:, 6:])) / reach
-        # a step's error is of second order in its length, and of first order in the noise that scoring expects away
-        left = float(np.sqrt(max(expected, 0.0)) * (relative + noise_share))
-        turned = np.eye(size, 3)
-        chi2 = plane.chi2
-        if size > 3:
-            # among all bases of the new plane the one nearest to the old: then the scalar part only follows it
-            leading = np.linalg.eigh(moments)[1][:, -3:]
-            u, _, vt = np.linalg.svd(leading[:3])
-            turned = leading @ vt.T @ u.T
-            follow = turned[:3].T
-            matrix, offset = matrix @ np.linalg.inv(follow), follow @ offset
-            across = moments[3:, 3:] - moments[3:, :3] @ np.linalg.solve(moments[:3, :3], moments[:3, 3:])
-            chi2 = float(np.trace(across)) / ((size - 3) * (count - 4) / count)
-            tilt = float(np.linalg.norm(turned[3:], 2))
-            left = max(left, tilt * np.sqrt(chi2 * count))
-        basis = self.axes @ turned
-        offset = offset + turned[3:].T @ mean[3:] + basis.T @ plane.mean
-        moved = CommonField(plane.noise, basis, plane.mean + self.axes @ mean, count, chi2)
-        return moved, ScalarFit(matrix, offset, after.cost / max(count - 9, 1), after), left
+    total, square, scores = sums.summed()
+    if not np.isfinite(scores.cost + total.sum()):
+        raise DataError("the samples are not all finite", hint="mask the gaps before calibrating")
+    count, size = scores.samples, len(sums.axes)
+    mean = total / count
+    moments = square / count - np.outer(mean, mean)
+    step, expected = scoring_step(scores)
+    matrix, offset = stepped(scalar.matrix, scalar.offset - sums.centre[:3], step)
+    after = replace(scores, cost=max(scores.cost - expected, 0.0), gradient=np.zeros(9))
+    reach = np.sqrt(np.mean(np.diag(after.moments)[:3] * 3.0) / count)
+    relative = max(np.abs(step[:6]).max(), np.abs(step[6:]).max() / reach)
+    noise_share = np.sqrt(scores.cost / np.trace(after.normal[6:, 6:])) / reach
+    # a step's error is of second order in its length, and of first order in the noise that scoring expects away
+    left = float(np.sqrt(max(expected, 0.0)) * (relative + noise_share))
+    turned = np.eye(size, 3)
+    chi2 = plane.chi2
+    if size > 3:
+        # among all bases of the new plane the one nearest to the old: then the scalar part only follows it
+        leading = np.linalg.eigh(moments)[1][:, -3:]
+        u, _, vt = np.linalg.svd(leading[:3])
+        turned = leading @ vt.T @ u.T
+        follow = turned[:3].T
+        matrix, offset = matrix @ np.linalg.inv(follow), follow @ offset
+        across = moments[3:, 3:] - moments[3:, :3] @ np.linalg.solve(moments[:3, :3], moments[:3, 3:])
+        chi2 = float(np.trace(across)) / ((size - 3) * (count - 4) / count)
+        tilt = float(np.linalg.norm(turned[3:], 2))
+        left = max(left, tilt * np.sqrt(chi2 * count))
+    basis = sums.axes @ turned
+    offset = offset + turned[3:].T @ mean[3:] + basis.T @ plane.mean
+    moved = CommonField(plane.noise, basis, plane.mean + sums.axes @ mean, count, chi2)
+    return moved, ScalarFit(matrix, offset, after.cost / max(count - 9, 1), after), left

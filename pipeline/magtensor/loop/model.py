@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from magtensor.calibration import joint
 from magtensor.calibration.joint import JointFit, fit_joint, nearest_frame
 from magtensor.calibration.nominal import Nominal, fit_nominal
 from magtensor.calibration.types import Array
@@ -282,6 +283,14 @@ def require_determined(record: Record, state: State, how: Fitting) -> None:
     """
     raw, reference = without(record, [a.terms(state.excitation) for a in state.adopted], state.theta)
     _fit(record, raw, reference, replace(how, complete=True), np.asarray(state.fit.keep))
+
+
+def with_colour(record: Record, state: State, how: Fitting) -> State:
+    """The state whose calibration knows the colour of its noise, as its covariance needs it."""
+    keep = slice(None) if state.fit.keep.all() else state.fit.keep
+    raw, reference = without(record, [a.terms(state.excitation) for a in state.adopted], state.theta)
+    assert reference is not None
+    return replace(state, fit=joint.with_colour(state.fit, raw[keep], reference[keep], how.reference_noise))
 
 
 def without(record: Record, each: Sequence[Terms], theta: Sequence[Array]) -> tuple[Array, Array | None]:

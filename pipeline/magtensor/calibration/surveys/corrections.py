@@ -6,9 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from magtensor.calibration.axes import turned_words
 from magtensor.calibration.common_scale import nominal, nominal_scale
-from magtensor.calibration.joint import nearest_frame
+from magtensor.calibration.joint import diagnostics, nearest_frame
 from magtensor.calibration.types import Array, ArrayCalibration
 
 from .covariance import forward_covariance, to_corrections, with_offset
@@ -70,23 +69,13 @@ def calibrated_surveys(fit: SurveysFit) -> SurveysCalibration:
     matrix: Array = np.asarray(np.linalg.inv(forward), dtype=np.float64)
     chain = to_corrections(matrix, len(fit.offset))
     covariance = chain @ forward_covariance(fit, forward, q) @ chain.T
-    diagnostics: dict[str, float | str] = {
-        "samples": float(fit.keep.sum()),
-        "rejected": float((~fit.keep).sum()),
-        "chi2_total_field": fit.chi2_along,
-        "chi2_contrasts": fit.plane.chi2,
-        "noise_nT": float(np.sqrt(np.mean(fit.plane.noise**2))),
-        "condition_number": fit.coverage.condition_number,
-        "missing_attitudes": fit.coverage.missing,
-        "further_postures": str(fit.coverage.further),
-        "axes": "; ".join(turned_words(matrix)),
-    }
+    told = diagnostics(fit.keep, fit.chi2_along, fit.plane, fit.coverage, matrix)
     frame = "array (nearest to the raw axes)"
     free: tuple[str, ...] = ("one rotation of the whole array: the frame nearest to the raw axes was chosen",)
     if fit.attitude_std is not None:
-        diagnostics["attitude_std_deg"] = float(np.degrees(fit.attitude_std))
-        diagnostics["attitude_excess"] = fit.attitude_excess
+        told["attitude_std_deg"] = float(np.degrees(fit.attitude_std))
+        told["attitude_excess"] = fit.attitude_excess
         frame, free = "platform (by the attitude and the known field)", ()
     with_first = with_offset(len(matrix), np.eye(len(fit.offset))[0])
-    common = ArrayCalibration(matrix, fit.offset[0], with_first @ covariance @ with_first.T, frame, free, diagnostics)
+    common = ArrayCalibration(matrix, fit.offset[0], with_first @ covariance @ with_first.T, frame, free, told)
     return SurveysCalibration(common, fit.offset, covariance)
