@@ -46,6 +46,8 @@ every recipe.
 - `needs` names what it cannot do without: channels (`current_*`), `attitude`, `position`, `total_field`, `rotation`
   (samples dense enough for rates of change), `gradient` (a field that differs between the sensors); `a|b` where one of
   two will do.
+- `pointwise=True` says that its regressors at a sample follow from that sample alone; settings with many values are
+  then searched faster.
 
 `check_error_model(my_model)` of `magtensor.loop.checker` gives a list of everything that is wrong with it; put
 `assert check_error_model(my_model) == []` into your tests.

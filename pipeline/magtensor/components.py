@@ -78,6 +78,7 @@ class Component:
     suffixes: tuple[str, ...] = ()  # of a reader: the file names it recognises
     effect: Literal["", "instrument", "site", "reference"] = ""  # of an error model: what it is an error of
     typical: str = ""  # of an error model: its usual magnitude
+    pointwise: bool = False  # of an error model: its regressors at a sample need no other sample
     several: bool = False  # of a stage: it also fits the further surveys that a recipe names
     long: Callable[..., Any] | None = None  # of a stage: what it does with a recording longer than the memory
 
@@ -260,6 +261,7 @@ def error_model(
     needs: Iterable[str] = (),
     source: str = "",
     typical: str = "",
+    pointwise: bool = False,
 ) -> Callable[[F], F]:
     """Mark ``function(x: Excitation, *, settings) -> Terms`` as an error model.
 
@@ -271,9 +273,14 @@ def error_model(
             `current_*`), `attitude`, `position`, `total_field`, `rotation` (samples dense enough for rates of change).
         source: where the model comes from.
         typical: its usual magnitude, in words.
+        pointwise: its regressors at a sample follow from that sample alone, so that its settings are searched on a
+            few samples only, without the others being computed.
     """
     _with_parentheses("error_model", effect)
-    return _mark("error_model", name, declares=Declares(tuple(needs)), effect=effect, source=source, typical=typical)
+    return _mark(
+        "error_model", name, declares=Declares(tuple(needs)), effect=effect, source=source, typical=typical,
+        pointwise=pointwise,
+    )  # fmt: skip
 
 
 def component_of(candidate: object) -> Component | None:

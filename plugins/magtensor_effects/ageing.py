@@ -77,6 +77,7 @@ def warm_up(
     "instrument",
     source="perming of fluxgate cores",
     typical="1 to 10 nT after a shock, or from one posture to the next",
+    pointwise=True,
 )
 def offset_step(x: Excitation, *, time_s: EventTime = 0.0) -> Terms:
     """Each axis's offset jumps at a time: a core was magnetised by a shock, a connector touched.
@@ -91,6 +92,7 @@ def offset_step(x: Excitation, *, time_s: EventTime = 0.0) -> Terms:
     "instrument",
     source="diagonal part of a jump of C",
     typical="5 nT for 100 ppm: a range switched, a feedback resistor or reference voltage that has changed",
+    pointwise=True,
 )
 def scale_step(x: Excitation, *, time_s: EventTime = 0.0) -> Terms:
     """Each axis's scale factor jumps at a time: a range, a feedback resistor or a reference voltage changed.

@@ -47,6 +47,7 @@ def frame_flexure(x: Excitation) -> Terms:
     "instrument",
     source="small rotation of the field at the sensor",
     typical="14.5 nT for 1 arcmin in 50 000 nT",
+    pointwise=True,
 )
 def turn_step(x: Excitation, *, time_s: EventTime = 0.0) -> Terms:
     """Each sensor turns in its mount at a time: a knock, a screw that gave way.

@@ -65,7 +65,9 @@ def reference_clock(
     return x.on_reference(-slope, "s", "delay")
 
 
-@error_model("reference", needs=("total_field",), source="shift in level", typical="any: the station's new place")
+@error_model(
+    "reference", needs=("total_field",), source="shift in level", typical="any: the station's new place", pointwise=True
+)
 def reference_step(
     x: Excitation,
     *,

@@ -104,6 +104,7 @@ def _harmonic(name: str, places: Array) -> Array:
     "site",
     source="dipole on a straight track: Anderson functions",
     typical="a car of 200 A m2: 20 nT at 10 m for some seconds",
+    pointwise=True,
 )
 def passing_source(
     x: Excitation,

@@ -181,6 +181,12 @@ def endless(x):
         return x.offsets(1.0 / x.elapsed, "nT s")
 
 
+@error_model("instrument", source="nowhere", typical="1 nT", pointwise=True)
+def with_memory(x):
+    """It says that it looks at each sample by itself, and does not."""
+    return x.responses(x.relaxed(x.output, 10.0), "1")
+
+
 @error_model("instrument", source="nowhere", typical="1 nT")
 def out_of_range(x, *, tau_s: Annotated[float, Range(1.0, 10.0)] = 20.0):
     """A setting whose default is outside its range."""
@@ -197,6 +203,7 @@ def out_of_range(x, *, tau_s: Annotated[float, Range(1.0, 10.0)] = 20.0):
         (of_sensors, ["no docstring", "no source", "no typical", "of the reference but acts on the sensors"]),
         (repeated, ["linearly dependent: rank 12"]),
         (destructive, ["read-only"]),
+        (with_memory, ["marked pointwise"]),
         (unstable, ["distorted and corrected again"]),
         (lambda x: x, ["not marked"]),
     ],

@@ -82,8 +82,8 @@ def block_count(samples: int) -> int:
     return int(np.clip(samples // LEAST_PER_BLOCK, 1, FINEST_BLOCKS))
 
 
-def assess(residual: Residual, terms: Terms, colours: Colours, given: Terms | None = None) -> Assessment:
-    """Assess terms that no model holds yet, the coefficients of the given ones being free as well.
+def assess(now: Whitened, terms: Terms) -> Assessment:
+    """Assess terms that no model holds yet, the coefficients of those that are in already being free as well.
 
     Two colours of noise are needed. A test of the null hypothesis uses the colour of the residual as it is: slow noise
     that a flexible model could follow must count as noise. How much the terms explain, and how well they compare with
@@ -91,27 +91,24 @@ def assess(residual: Residual, terms: Terms, colours: Colours, given: Terms | No
 
     Parameters
     ----------
-    residual: of the current model.
+    now: the residual of the current model with its terms, in noise of the residual's own colour.
     terms: with the residual's samples as rows.
-    colours: of the residual.
-    given: terms of the current model, whose coefficients are fitted along.
     """
+    residual, given = now.residual, now.given
     together = terms if given is None else joined([given, terms])
     first = together.count - terms.count
     own = list(range(first, together.count))
     blocked = np.arange(together.count) < first
     count = block_count(len(residual.affine))
-    null = grams(residual, together, colours.across, colours.along, count)
+    null = grams_in(now, terms, count)
     null_gain = held_out_gain(null, residual.freedom, blocked)
     null_p = _p_of(null, first)
-    best = likeliest(residual, together, [colours, WHITE])
-    now = best.colours
-    blocks = grams(residual, together, now.across, now.along, count)
-    n, y = normal(blocks.total())
-    estimate = solve(n[0], y[0], own_information(blocks))
+    best = likeliest(residual, together, [Colours(now.across, now.along), WHITE], _estimate(null).theta)
+    colours = best.colours
+    blocks = grams(residual, together, colours.across, colours.along, count)
     p = family_p(blocks, together.sensors, own)
     gain = held_out_gain(blocks, residual.freedom, blocked)
-    return Assessment(estimate, gain, null_gain, p, null_p, now, best.theta)
+    return Assessment(_estimate(blocks), gain, null_gain, p, null_p, colours, best.theta)
 
 
 @dataclass(frozen=True)
@@ -123,17 +120,26 @@ class Likeliest:
     log_likelihood: float
 
 
-def likeliest(residual: Residual, terms: Terms, guesses: Sequence[Colours]) -> Likeliest:
+def likeliest(residual: Residual, terms: Terms, guesses: Sequence[Colours], first: Array | None = None) -> Likeliest:
     """The likeliest coefficients and colour, found from first guesses of the colour.
 
     They depend on each other, and may agree in two ways: the terms explain what is slow, or the noise does and the
     terms follow its middle frequencies. Where one guess leads is not where another does, a law that fits the spectrum
     badly may lead away from both, and the likelihood says which to believe.
+
+    Parameters
+    ----------
+    first: (P,) coefficients in noise of the first guess, where they are known.
     """
     found: list[Likeliest] = []
-    for colours in guesses:
+    for number, colours in enumerate(guesses):
+        if any(_alike(colours, before) for before in guesses[:number]):
+            continue
         for _ in range(_ROUNDS):
-            theta = estimated(residual, terms, colours).theta
+            if first is not None and colours is guesses[0]:
+                theta = first
+            else:
+                theta = estimated(residual, terms, colours).theta
             left = taken_off(residual, terms, theta)
             after = colours_of(left, stiff=True)
             found.append(Likeliest(theta, after, log_likelihood(left, after)))
@@ -159,23 +165,26 @@ def log_likelihood(residual: Residual, colours: Colours) -> float:
     total += 2.0 * len(residual.affine) * residual.freedom * float(np.mean(np.log(residual.noise)))
     if residual.across is not None:
         total += (size - 3) * colours.across.log_volume(len(residual.affine))
-        total += float(np.sum(colours.across.whiten(residual.across) ** 2))
+        total += float(np.sum(colours.across.whiten(residual.across, back=False) ** 2))
     if residual.along is not None:
         total += colours.along.log_volume(len(residual.affine))
-        total += float(np.sum(colours.along.whiten(residual.along) ** 2))
+        total += float(np.sum(colours.along.whiten(residual.along, back=False) ** 2))
     return -total / 2.0
 
 
 def estimated(residual: Residual, terms: Terms, colours: Colours) -> Estimate:
     """Coefficients in noise of given colours."""
-    return estimated_in(Whitened.of(residual, colours.across, colours.along), terms)
+    return estimated_in(Whitened.of(residual, colours.across, colours.along, over_time=False), terms)
 
 
-def estimated_in(white: Whitened, terms: Terms) -> Estimate:
-    """The same where several terms are judged in one residual."""
-    whole = grams_in(white, terms)
-    n, y = normal(whole)
-    return solve(n[0], y[0], own_information(whole))
+def estimated_in(white: Whitened, terms: Terms | None) -> Estimate:
+    """The same of the terms that are in a whitened residual already, and of more where there are any."""
+    return _estimate(grams_in(white, terms))
+
+
+def _estimate(blocks: Grams) -> Estimate:
+    n, y = normal(blocks.total())
+    return solve(n[0], y[0], own_information(blocks))
 
 
 def explained(estimate: Estimate) -> float:

@@ -159,6 +159,11 @@ def _regressors(component: Component, x: Excitation, settings: Mapping[str, Any]
         found.append("gives something else when called again: use no randomness, keep no state")
     if any(not units for units in terms.units):
         found.append("a coefficient has no units ('1' for a pure number)")
+    if component.pointwise:
+        some = np.arange(0, len(x.time), 3)
+        alone = component.function(x.at(some), **settings).series
+        if not np.allclose(alone, terms.series[some], rtol=1e-9, atol=1e-12 * np.abs(terms.series).max(initial=0.0)):
+            found.append("is marked pointwise, but its regressors at a sample depend on other samples")
     keys = list(zip(terms.names, terms.sensors, strict=True))
     if len(set(keys)) < len(keys):
         twice = sorted({f"{n} {s}".strip() for n, s in keys if keys.count((n, s)) > 1})

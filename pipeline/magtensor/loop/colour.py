@@ -42,8 +42,11 @@ class Colour:
         spread = 0.0 if self.power is None else float(np.sum(np.log(self.power)))
         return count * float(np.log(self.white)) + spread
 
-    def whiten(self, series: Array) -> Array:
-        """Filter (N,) or (N, K) so that noise of this colour becomes white with unit variance."""
+    def whiten(self, series: Array, *, back: bool = True) -> Array:
+        """Filter (N,) or (N, K) so that noise of this colour becomes white with unit variance.
+
+        Without `back` it stays in the cosine transform, where sums of products over all samples are the same.
+        """
         scale = 1.0 / np.sqrt(self.white)
         if self.power is None:
             return series * scale
@@ -54,7 +57,8 @@ class Colour:
         weight = (scale / np.sqrt(self.power))[:, None]
         for start in range(0, columns.shape[1], _COLUMNS):
             part = slice(start, start + _COLUMNS)
-            out[:, part] = idct(dct(columns[:, part], axis=0, norm="ortho") * weight, axis=0, norm="ortho")
+            spectrum = dct(columns[:, part], axis=0, norm="ortho") * weight
+            out[:, part] = idct(spectrum, axis=0, norm="ortho") if back else spectrum
         return out.reshape(series.shape)
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from magtensor.calibration.types import Array
 from magtensor.loop.colour import Colour
 from magtensor.loop.residual import Residual
-from magtensor.loop.terms import REFERENCE, Terms
+from magtensor.loop.terms import REFERENCE, Terms, joined
 from magtensor.loop.turned import TurnedColour
 
 IDENTIFIABLE = 1e-6  # of a regressor's own information: less than this is left after the fit's own freedom
@@ -82,12 +82,15 @@ class Grams:
 
 @dataclass(frozen=True)
 class Whitened:
-    """A residual and the fit's own freedom in noise made white: what does not depend on the terms.
+    """A residual, the fit's own freedom and the models already in it, in noise made white: what new terms are added to.
 
     Attributes:
         residual: of N samples; across, along: the colours of its two parts.
         z, e: (N, 4) affine functions and (N, 3 S) the residual across; None for a single sensor.
         inner, r: (N, 12) and (N,) along; None without a total field.
+        given: terms that are in already; None without any.
+        series, columns: their series (N, K) across and columns (N, P) along; None where there are none.
+        over_time: whether the rows are samples; where only sums over all of them are asked for they need not be.
     """
 
     residual: Residual
@@ -97,57 +100,108 @@ class Whitened:
     e: Array | None
     inner: Array | None
     r: Array | None
+    given: Terms | None = None
+    series: Array | None = None
+    columns: Array | None = None
+    over_time: bool = True
 
     @classmethod
-    def of(cls, residual: Residual, across: Colour, along: Colour | TurnedColour) -> Whitened:
+    def of(
+        cls,
+        residual: Residual,
+        across: Colour,
+        along: Colour | TurnedColour,
+        given: Terms | None = None,
+        *,
+        over_time: bool = True,
+    ) -> Whitened:
         z = e = inner = r = None
         if residual.across is not None:
-            z, e = across.whiten(residual.affine), across.whiten(residual.across)
+            z, e = across.whiten(residual.affine, back=over_time), across.whiten(residual.across, back=over_time)
         if residual.along is not None:
-            both = along.whiten(np.column_stack([residual.inner, residual.along]))
+            both = along.whiten(np.column_stack([residual.inner, residual.along]), back=over_time)
             inner, r = both[:, :12], both[:, 12]
-        return cls(residual, across, along, z, e, inner, r)
+        white = cls(residual, across, along, z, e, inner, r, over_time=over_time)
+        if given is None:
+            return white
+        return replace(white, given=given, series=white.series_of(given), columns=white.columns_of(given))
+
+    def series_of(self, terms: Terms) -> Array | None:
+        """(N, K) whitened as the residual across; None where it does not see them."""
+        if self.e is None or not (terms.part_output != REFERENCE).any():
+            return None
+        return self.across.whiten(terms.series, back=self.over_time)
+
+    def columns_of(self, terms: Terms) -> Array | None:
+        """(N, P) whitened as the residual along; None where there is none."""
+        return None if self.r is None else self.along.whiten(_along(self.residual, terms), back=self.over_time)
 
 
-def grams(residual: Residual, terms: Terms, across: Colour, along: Colour | TurnedColour, blocks: int = 1) -> Grams:
+def grams(
+    residual: Residual,
+    terms: Terms | None,
+    across: Colour,
+    along: Colour | TurnedColour,
+    blocks: int = 1,
+    given: Terms | None = None,
+) -> Grams:
     """Gram matrices of terms evaluated at the residual's samples, in contiguous blocks.
 
     Parameters
     ----------
     terms: their series have the residual's samples as rows.
     across, along: the colours of the two parts of the residual.
+    given: terms that come before them.
     """
-    return grams_in(Whitened.of(residual, across, along), terms, blocks)
+    return grams_in(Whitened.of(residual, across, along, given), terms, blocks)
 
 
-def grams_in(white: Whitened, terms: Terms, blocks: int = 1) -> Grams:
-    """The same where several terms are judged in one residual."""
+def grams_in(white: Whitened, terms: Terms | None, blocks: int = 1) -> Grams:
+    """The same of the terms that are in a whitened residual already, and of more where there are any."""
     residual = white.residual
+    assert white.over_time or blocks == 1
+    together = joined([t for t in (white.given, terms) if t is not None])
     n, size = len(residual.affine), len(residual.noise)
     edges = np.linspace(0, n, blocks + 1).round().astype(int)
     pieces = list(itertools.pairwise(edges))
-    k, p = terms.series.shape[1], terms.count
-    raw = terms.part_output != REFERENCE
+    k, p = together.series.shape[1], together.count
     zz, zd, dd = np.zeros((blocks, 4, 4)), np.zeros((blocks, 4, k)), np.zeros((blocks, k, k))
     ze, de, ee = np.zeros((blocks, 4, size)), np.zeros((blocks, k, size)), np.zeros(blocks)
     if white.z is not None and white.e is not None:
         z, e = white.z, white.e
-        d = white.across.whiten(terms.series) if raw.any() else None
+        d = _beside(white.series, white.given, terms, white.series_of)
         for i, (a, b) in enumerate(pieces):
             zz[i], ze[i], ee[i] = z[a:b].T @ z[a:b], z[a:b].T @ e[a:b], np.sum(e[a:b] ** 2)
-            if d is not None:
-                zd[i], dd[i], de[i] = z[a:b].T @ d[a:b], d[a:b].T @ d[a:b], d[a:b].T @ e[a:b]
+            zd[i], dd[i], de[i] = z[a:b].T @ d[a:b], d[a:b].T @ d[a:b], d[a:b].T @ e[a:b]
     aa, ar, rr = np.zeros((blocks, 12 + p, 12 + p)), np.zeros((blocks, 12 + p)), np.zeros(blocks)
     if white.inner is not None and white.r is not None:
-        columns = np.column_stack([white.inner, white.along.whiten(_along(residual, terms))])
+        columns = [c for c in (white.inner, white.columns) if c is not None]
+        if terms is not None:
+            more = white.columns_of(terms)
+            assert more is not None
+            columns.append(more)
+        every = np.hstack(columns)
         for i, (a, b) in enumerate(pieces):
-            part, r = columns[a:b], white.r[a:b]
+            part, r = every[a:b], white.r[a:b]
             aa[i], ar[i], rr[i] = part.T @ part, part.T @ r, r @ r
     samples = np.diff(edges).astype(float)
     return Grams(
         zz, zd, dd, ze, de, ee, aa, ar, rr, samples,
-        terms.part_term, terms.part_output, terms.part_series, p, residual.projector, residual.noise,
+        together.part_term, together.part_output, together.part_series, p, residual.projector, residual.noise,
     )  # fmt: skip
+
+
+def _beside(
+    known: Array | None, given: Terms | None, terms: Terms | None, whitened: Callable[[Terms], Array | None]
+) -> Array:
+    """(N, K) the series of the given terms and of more; zero where the residual across does not see them."""
+    parts = []
+    if given is not None:
+        parts.append(np.zeros_like(given.series) if known is None else known)
+    if terms is not None:
+        more = whitened(terms)
+        parts.append(np.zeros_like(terms.series) if more is None else more)
+    return parts[0] if len(parts) == 1 else np.hstack(parts)
 
 
 def _along(residual: Residual, terms: Terms) -> Array:

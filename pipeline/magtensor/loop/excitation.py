@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from functools import cached_property
 from itertools import pairwise
@@ -55,6 +55,23 @@ class Excitation:
     attitude: Array | None = None
     lines: Sequence[float] = ()
     waveform: Array | None = None
+
+    def at(self, samples: NDArray[np.int_]) -> Excitation:
+        """What an error model sees that looks at some of the samples only, each by itself."""
+        chosen = replace(
+            self,
+            time=self.time[samples],
+            output=self.output[samples],
+            field=self.field[samples],
+            total_field=None if self.total_field is None else self.total_field[samples],
+            logged={name: values[samples] for name, values in self.logged.items()},
+            run=self.run[samples],
+            segment=self.segment[samples],
+            attitude=None if self.attitude is None else self.attitude[samples],
+            waveform=None if self.waveform is None else self.waveform[samples],
+        )
+        vars(chosen)["matrix"] = self.matrix  # that of all samples
+        return chosen
 
     @property
     def duration(self) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -141,7 +142,6 @@ class State:
         residual: what is left, and its tangent space.
         excitation: at all samples of the record.
         terms: of all adopted models, at the residual's samples; None without any.
-        colours: of the residual.
         estimate: of all coefficients together; None without any.
     """
 
@@ -151,9 +151,13 @@ class State:
     residual: Residual
     excitation: Excitation
     terms: Terms | None
-    colours: Colours
     estimate: Estimate | None = None
     lines: tuple[float, ...] = field(default=())
+
+    @cached_property
+    def colours(self) -> Colours:
+        """Of the residual."""
+        return colours_of(self.residual)
 
 
 @dataclass(frozen=True)
@@ -232,7 +236,7 @@ def joint_state(
     residual = residual_of(fit, raw, reference, how.reference_noise)
     if adopted:
         terms = joined([a.terms(x) for a in adopted]).at(residual.samples)
-    return State(tuple(adopted), tuple(theta), fit, residual, x, terms, colours_of(residual), estimate, tuple(lines))
+    return State(tuple(adopted), tuple(theta), fit, residual, x, terms, estimate, tuple(lines))
 
 
 def _share(residual: Residual, terms: Terms, step: Array, colours: Colours) -> float:

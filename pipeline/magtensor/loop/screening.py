@@ -35,6 +35,9 @@ ALPHA = 0.005  # family-wise probability that a clean survey gets an adoption, b
 LEAST_REDUCTION = 1e-4  # of the held-out sum of squares: smaller is significant only in very long surveys
 LOG_MARGIN = 1.5  # the noise of a log is known to some per cent, and a dozen coefficients gain a little by chance
 SCREENED = 8  # models looked at closely in each round
+ALWAYS = 2  # of them, however little they explain
+LEAST_RATIO = 2.0  # of the time constants, lags or widths of a model adopted twice
+HOPELESS = 0.5  # corrected p value in the kinder of two colours of noise
 SCREENING_SAMPLES = 2000  # settings are profiled on so many samples
 REFINING_SAMPLES = 6000  # and the best of them refined on so many
 _REFINEMENTS = 8
@@ -95,10 +98,20 @@ class Candidate:
 
 
 def repeatable(model: Component) -> bool:
-    """A model that can be adopted more than once, with other settings: one that chooses a channel, time or line."""
+    """A model that can be adopted more than once, with other settings.
+
+    One that chooses a channel, time or line may act through several; a time constant, lag or width is seldom a single
+    one, and what a second leaves is better called more of the same than something else.
+    """
     from magtensor.loop.settings import AnyChannel, Frequencies
 
-    return any(isinstance(g, (AnyChannel, EventTimes, Frequencies)) for g in profiled(model).values())
+    grids = profiled(model).values()
+    return any(isinstance(g, (AnyChannel, EventTimes, Frequencies)) or _of_ratios(g) for g in grids)
+
+
+def _of_ratios(grid: Any) -> bool:
+    """A setting whose values differ by factors: a time constant, lag or width."""
+    return isinstance(grid, Range) and grid.low >= 0
 
 
 def profiled(model: Component) -> dict[str, Any]:
@@ -125,16 +138,18 @@ def candidates_of(state: State, models: Sequence[Component], failed: dict[str, s
     residual = state.residual
     white = Scorer(residual, state.terms, WHITE)
     coloured = Scorer(residual, state.terms, state.colours)
+    now = Whitened.of(residual, state.colours.across, state.colours.along, state.terms)
     few = _Thinned.of(state)
     scored: list[_Screened] = []
     for model in models:
         for settings, tried in _best_settings(model, state, few, failed, alpha / max(len(models), 1)):
             terms = _terms(model, settings, state.excitation, failed)
-            assert terms is not None
+            if terms is None or not terms.count:
+                continue
             terms = terms.at(residual.samples)
             scored.append(_Screened(model, settings, tried, white(terms), coloured(terms)))
     names = {s.model.name for s in scored}
-    looked_at = _shortlist(scored, lambda s: s.white) + _shortlist(scored, lambda s: s.coloured)
+    looked_at = _shortlist(scored, lambda s: s.white, len(names)) + _shortlist(scored, lambda s: s.coloured, len(names))
     assessed: dict[tuple[str, str], Assessed] = {}
     for each in looked_at:
         refined = _refined(each.model, each.settings, state, failed)
@@ -145,7 +160,7 @@ def candidates_of(state: State, models: Sequence[Component], failed: dict[str, s
             terms = _terms(each.model, settings, state.excitation, failed)
             assert terms is not None
             terms = terms.at(residual.samples)
-            assessment = assess(residual, terms, state.colours, state.terms)
+            assessment = assess(now, terms)
             assessed[key] = Adopted(each.model, settings), each.tried, terms, assessment
     found = _one_each(state, list(assessed.values()))
     adjusted = _holm([a.p * tried for _, tried, _, a in found], len(names))
@@ -177,19 +192,39 @@ class _Screened:
     white: float
     coloured: float
 
+    def promises(self, models: int) -> bool:
+        """Whether it may be significant among so many models when it is looked at closely."""
+        return bool(np.exp(-max(self.white, self.coloured)) * self.tried * models < HOPELESS)
+
 
 @dataclass(frozen=True)
 class _Thinned:
-    """Some samples of a residual, on which settings are profiled, and how terms score there."""
+    """Some samples of a residual, on which settings are profiled, and how terms score there.
+
+    Attributes:
+        every, own: what models see of all samples, and of these.
+        white, coloured: in white noise and in noise of the residual's own colour.
+    """
 
     residual: Residual
+    every: Excitation
+    own: Excitation
     white: Scorer
     coloured: Scorer
 
     @classmethod
     def of(cls, state: State) -> _Thinned:
         residual, given = _thinned(state, SCREENING_SAMPLES)
-        return cls(residual, Scorer(residual, given, WHITE), Scorer(residual, given, colours_of(residual)))
+        colours, x = colours_of(residual), state.excitation
+        scorers = Scorer(residual, given, WHITE), Scorer(residual, given, colours)
+        return cls(residual, x, x.at(residual.samples), *scorers)
+
+    def terms(self, model: Component, settings: Mapping[str, Any], failed: dict[str, str]) -> Terms | None:
+        """As `_terms`, at the samples."""
+        if model.pointwise:
+            return _terms(model, settings, self.own, failed)
+        terms = _terms(model, settings, self.every, failed)
+        return None if terms is None else terms.at(self.residual.samples)
 
 
 def _best_settings(
@@ -202,16 +237,14 @@ def _best_settings(
     """
     grid = [g for g in settings_grid(model, state.excitation) if not _already(state, model, g)]
     if len(grid) == 1:
-        terms = _terms(model, grid[0], state.excitation, failed)
-        return [(grid[0], 1.0)] if terms is not None and terms.count else []
+        return [(grid[0], 1.0)]
     scores: list[tuple[float, float, dict[str, Any]]] = []
     chain: list[float] = []
     last: Array | None = None
     for settings in grid:
-        terms = _terms(model, settings, state.excitation, failed)
+        terms = few.terms(model, settings, failed)
         if terms is None or not terms.count:
             continue
-        terms = terms.at(few.residual.samples)
         scores.append((few.white(terms), few.coloured(terms), settings))
         series = projected(terms, few.residual.affine)
         if last is not None:
@@ -224,13 +257,14 @@ def _best_settings(
     return [(settings, tried) for settings in (best[:1] if best[0] is best[1] else best)]
 
 
-def _shortlist(scored: Sequence[_Screened], score: Callable[[_Screened], float]) -> list[_Screened]:
-    """The models that explain most, each with the settings that do."""
+def _shortlist(scored: Sequence[_Screened], score: Callable[[_Screened], float], models: int) -> list[_Screened]:
+    """The models that explain most, each with the settings that do; of the hopeless ones hardly any."""
     best: dict[str, _Screened] = {}
     for each in scored:
         if each.model.name not in best or score(each) > score(best[each.model.name]):
             best[each.model.name] = each
-    return sorted(best.values(), key=score, reverse=True)[: SCREENED // 2]
+    first = sorted(best.values(), key=score, reverse=True)[: SCREENED // 2]
+    return [each for rank, each in enumerate(first) if rank < ALWAYS // 2 or each.promises(models)]
 
 
 def _one_each(state: State, assessed: Sequence[Assessed]) -> list[Assessed]:
@@ -251,17 +285,28 @@ def generic(model: Adopted) -> bool:
 
 
 def _already(state: State, model: Component, settings: Mapping[str, Any]) -> bool:
+    """Whether a model holds a channel already, or a setting on a range so near that the two could not be told apart."""
     from magtensor.loop.settings import AnyChannel
 
-    channels = {n for n, g in profiled(model).items() if isinstance(g, AnyChannel)}
+    grids = profiled(model)
+    channels = {n for n, g in grids.items() if isinstance(g, AnyChannel)}
+    ranges = {n for n, g in grids.items() if _of_ratios(g)}
+    others = set(grids) - channels - ranges
     for adopted in state.adopted:
-        if (
-            adopted.name == model.name
-            and all(adopted.settings.get(c) == settings.get(c) for c in channels)
-            and channels
+        if adopted.name != model.name:
+            continue
+        if channels:
+            if all(adopted.settings.get(c) == settings.get(c) for c in channels):
+                return True
+        elif all(adopted.settings.get(o) == settings.get(o) for o in others) and not any(
+            _apart(adopted.settings[n], settings[n]) for n in ranges
         ):
             return True
     return False
+
+
+def _apart(one: float, other: float) -> bool:
+    return max(one, other) > LEAST_RATIO * min(one, other)
 
 
 def _terms(model: Component, settings: Mapping[str, Any], x: Excitation, failed: dict[str, str]) -> Terms | None:
@@ -281,12 +326,11 @@ class Scorer:
     """How unlikely it is that as many random regressors explain as much beyond the adopted terms: -log of chance."""
 
     def __init__(self, residual: Residual, adopted: Terms | None, colours: Colours) -> None:
-        self.white, self.adopted = Whitened.of(residual, colours.across, colours.along), adopted
-        self.own = 0.0 if adopted is None else explained(estimated_in(self.white, adopted))
+        self.white = Whitened.of(residual, colours.across, colours.along, adopted, over_time=False)
+        self.own = 0.0 if adopted is None else explained(estimated_in(self.white, None))
 
     def __call__(self, terms: Terms) -> float:
-        together = terms if self.adopted is None else joined([self.adopted, terms])
-        estimate = estimated_in(self.white, together)
+        estimate = estimated_in(self.white, terms)
         return rarity(explained(estimate) - self.own, max(min(estimate.rank, terms.count), 1))
 
 

@@ -248,6 +248,7 @@ def _containing(best: Candidate, possible: Sequence[Candidate], state: State) ->
 def simplest(best: Candidate, possible: Sequence[Candidate], state: State) -> tuple[Candidate, tuple[str, ...]]:
     """The simplest of the models that the held-out blocks do not separate from the best, and the others' names.
 
+    Simplest is more of what was adopted already, with another setting; then what has the fewest coefficients.
     A model that slow noise could explain is named, and not chosen before one that it could not.
     """
     colours = best.assessment.colours
@@ -259,10 +260,12 @@ def simplest(best: Candidate, possible: Sequence[Candidate], state: State) -> tu
         spare = max(other.assessment.estimate.rank - best.assessment.estimate.rank, 0)
         if not separated(reference, fold_gain(state, colours, other.terms), spare):
             equal.append(other)
-    chosen = min(
-        (c for c in equal if c is best or c.passes),
-        key=lambda c: (generic(c.model), c.assessment.estimate.rank, -c.assessment.gain.total),
-    )
+    known = {a.name for a in state.adopted}
+
+    def complexity(c: Candidate) -> tuple[bool, bool, int, float]:
+        return generic(c.model), c.model.name not in known, c.assessment.estimate.rank, -c.assessment.gain.total
+
+    chosen = min((c for c in equal if c is best or c.passes), key=complexity)
     return chosen, tuple(sorted({c.model.name for c in equal if c is not chosen} - {chosen.model.name}))
 
 

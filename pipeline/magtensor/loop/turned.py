@@ -40,19 +40,38 @@ class SlowModes:
         n = len(self.response)
         return int(max(min(MOST_MODES, MOST_ENTRIES / (3 * n), n // 8), 0))
 
-    @cached_property
-    def columns(self) -> Array:
-        """(N, 3 K), three columns for each cosine, slowest first, without the constant."""
-        n = len(self.response)
-        at = (np.arange(n) + 0.5) * np.pi / n
-        cosines = np.sqrt(2.0 / n) * np.cos(at[:, None] * np.arange(1, self.most + 1))
-        out: Array = (cosines[:, :, None] * self.response[:, None, :]).reshape(n, -1)
+    def seen_in(self, series: Array) -> Array:
+        """(3 K, Q) products of (N, Q) with each cosine times response, three for each cosine, the slowest first."""
+        from scipy.fft import dct
+
+        n, k = len(self.response), self.most
+        turned = self.response.T[:, None, :] * series.T
+        sums = dct(turned, axis=2)[:, :, 1 : k + 1] / np.sqrt(2.0 * n)
+        out: Array = sums.transpose(2, 0, 1).reshape(3 * k, -1)
+        return out
+
+    def made_of(self, coefficients: Array) -> Array:
+        """(N, Q) series that have such coefficients (3 K', Q) in the slowest cosines times response."""
+        from scipy.fft import dct
+
+        n, q = len(self.response), coefficients.shape[1]
+        k = len(coefficients) // 3
+        spectrum = np.zeros((3, q, n))
+        spectrum[:, :, 1 : k + 1] = coefficients.reshape(k, 3, q).transpose(1, 2, 0) / np.sqrt(2.0 * n)
+        out: Array = np.einsum("nj,jqn->nq", self.response, dct(spectrum, axis=2, type=3))
         return out
 
     @cached_property
     def gram(self) -> Array:
-        """(3 K, 3 K)."""
-        out: Array = self.columns.T @ self.columns
+        """(3 K, 3 K): a product of two cosines is half the sum of those of their difference and sum."""
+        from scipy.fft import dct
+
+        n, k = len(self.response), self.most
+        products = self.response[:, :, None] * self.response[:, None, :]
+        sums = dct(products, axis=0, type=2)[: 2 * k + 1] / 2.0
+        order = np.arange(1, k + 1)
+        pairs = sums[np.abs(order[:, None] - order)] + sums[order[:, None] + order]
+        out: Array = (pairs / n).transpose(0, 2, 1, 3).reshape(3 * k, 3 * k)
         return out
 
 
@@ -78,33 +97,39 @@ class TurnedColour:
     @property
     def lowest(self) -> float:
         """Power at the lowest frequency over the white level."""
-        return self.rest.lowest * float(1.0 + self._spectrum[0].max())
+        shown = self.variance * np.diag(self.modes.gram)[: len(self.variance)]
+        return self.rest.lowest * float(1.0 + shown.max())
 
     @cached_property
-    def _spectrum(self) -> tuple[Array, Array]:
+    def _root(self) -> tuple[Array, Array]:
+        """sqrt(variance) (M,), and the lower Cholesky factor (M, M) of one plus the modes' power over the white."""
         size = np.sqrt(self.variance)
         m = len(size)
-        values, vectors = np.linalg.eigh(self.modes.gram[:m, :m] * np.outer(size, size))
-        return np.maximum(values, 0.0), vectors * size[:, None]
+        return size, np.linalg.cholesky(np.eye(m) + self.modes.gram[:m, :m] * np.outer(size, size))
 
     def log_volume(self, count: int) -> float:
         """As `Colour.log_volume`."""
-        return self.rest.log_volume(count) + float(np.sum(np.log1p(self._spectrum[0])))
+        return self.rest.log_volume(count) + 2.0 * float(np.sum(np.log(np.diag(self._root[1]))))
 
-    def whiten(self, series: Array) -> Array:
+    def whiten(self, series: Array, *, back: bool = True) -> Array:
         """As `Colour.whiten`."""
-        return self.rest.whiten(self.still(series))
+        return self.rest.whiten(self.still(series), back=back)
 
     def still(self, series: Array) -> Array:
-        """(N,) or (N, K) with the slow noise filtered down to the white level."""
-        values, vectors = self._spectrum
-        seen = values > 1e-12
-        u = vectors[:, seen]
-        weight = (1.0 - 1.0 / np.sqrt(1.0 + values[seen])) / values[seen]
-        columns = self.modes.columns[:, : len(self.variance)]
-        shown = u.T @ (columns.T @ series)
-        out: Array = series - columns @ (u @ (weight * shown.T).T)
-        return out
+        """(N,) or (N, Q) with the slow noise filtered down to the white level.
+
+        With columns A of the noise's standard deviation, G = A' A and its Cholesky factor K of 1 + G, the filter
+        1 - A (1 + K')^-1 K^-1 A' is a root of (1 + A A')^-1.
+        """
+        from scipy.linalg import solve_triangular
+
+        size, root = self._root
+        columns = series.reshape(len(series), -1)
+        shown = size[:, None] * self.modes.seen_in(columns)[: len(size)]
+        shown = solve_triangular(root, shown, lower=True, check_finite=False)
+        shown = solve_triangular(root + np.eye(len(size)), shown, lower=True, trans="T", check_finite=False)
+        out: Array = columns - self.modes.made_of(size[:, None] * shown)
+        return out.reshape(series.shape)
 
 
 def excess_of(colour: Colour, most: int) -> Array:
@@ -122,16 +147,18 @@ def excess_of_one(modes: SlowModes, along: Array, white: float) -> Array:
     if count < 1:
         return np.zeros(0)
     gram = modes.gram[: 3 * count, : 3 * count]
-    right = modes.columns[:, : 3 * count].T @ along
+    right = modes.seen_in(along[:, None])[: 3 * count, 0]
     best, likeliest = np.zeros(0), 0.0
     for law in LAWS:
+        excess = 1.0 / np.arange(1, count + 1) ** law
+        size = np.sqrt(np.repeat(excess, 3))
+        values, vectors = np.linalg.eigh(gram * np.outer(size, size))
+        values = np.maximum(values, 0.0)
+        shown = (vectors.T @ (size * right)) ** 2 / white
         for strength in STRENGTHS:
-            excess = strength / np.arange(1, count + 1) ** law
-            size = np.sqrt(np.repeat(excess, 3))
-            values, vectors = np.linalg.eigh(gram * np.outer(size, size))
-            values = np.maximum(values, 0.0)
-            explained = np.sum((vectors.T @ (size * right)) ** 2 / (1.0 + values)) / white
-            likelihood = 0.5 * (explained - float(np.sum(np.log1p(values))))
+            powers = strength * values
+            explained = float(np.sum(strength * shown / (1.0 + powers)))
+            likelihood = 0.5 * (explained - float(np.sum(np.log1p(powers))))
             if likelihood > likeliest:
-                best, likeliest = excess, likelihood
+                best, likeliest = strength * excess, likelihood
     return best

@@ -80,8 +80,11 @@ def lasting(bad: Mask) -> Mask:
 
 def _still_significant(candidate: Candidate, state: State) -> bool:
     """Whether a model is asked for by the samples that are still in use."""
+    from magtensor.loop.evidence import Whitened
+
     terms = candidate.model.terms(state.excitation).at(state.residual.samples)
-    now = assess(state.residual, terms, state.colours, state.terms)
+    white = Whitened.of(state.residual, state.colours.across, state.colours.along, state.terms)
+    now = assess(white, terms)
     return now.p * candidate.tried < candidate.alpha and now.null_p * candidate.tried < ALPHA
 
 
