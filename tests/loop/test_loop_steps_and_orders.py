@@ -1,4 +1,4 @@
-"""Jumps that most of a survey's samples feel, and powers of a channel that only together predict."""
+"""Jumps that most of a survey's samples feel, powers of a channel that only together predict, two time constants."""
 
 from __future__ import annotations
 
@@ -68,3 +68,16 @@ def test_the_order_of_a_temperature_is_the_lowest_that_does(
     found = searched(loaded(tmp_path, scenario(4, *effects)), "temperature_offset", "temperature_scale", "offset_drift")
     (adopted,) = found.last.adopted
     assert (adopted.name, adopted.settings["order"]) == ("temperature_offset", order)
+
+
+VISCOUS = ("viscous_magnetisation", "hysteresis", "eddy_current", "sampling_lag", "bandwidth")
+
+
+@pytest.mark.parametrize("taus", [(8.0,), (2.0, 60.0)], ids=["one", "two"])
+def test_what_a_time_constant_leaves_is_another_one_and_no_other_effect(
+    taus: tuple[float, ...], tmp_path: Path
+) -> None:
+    effects = [{"type": "viscous_magnetisation", "tau_s": tau, "rms_nT": 1.0} for tau in taus]
+    found = searched(loaded(tmp_path, scenario(5, *effects)), *VISCOUS)
+    assert {a.name for a in found.last.adopted} == {"viscous_magnetisation"}
+    np.testing.assert_allclose(sorted(a.settings["tau_s"] for a in found.last.adopted), taus, rtol=0.2)
