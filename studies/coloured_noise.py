@@ -70,7 +70,7 @@ def main() -> None:
     print("|---|---|---|---|---|---|")
     for source, flicker in CASES:
         errors = []
-        for seed in range(1001, 1001 + seeds):
+        for seed in range(4001, 4001 + seeds):
             scenario = yaml.safe_load(DEMO.read_text()) | {"seed": seed}
             scenario["instrument"]["noise"]["flicker_nT_per_rtHz"] = flicker
             errors.append(ratios(scenario, source))

@@ -79,6 +79,7 @@ class Component:
     effect: Literal["", "instrument", "site", "reference"] = ""  # of an error model: what it is an error of
     typical: str = ""  # of an error model: its usual magnitude
     pointwise: bool = False  # of an error model: its regressors at a sample need no other sample
+    agrees: Callable[[Mapping[str, Any], Any], bool] | None = None  # of an error model: settings and coefficients
     several: bool = False  # of a stage: it also fits the further surveys that a recipe names
     long: Callable[..., Any] | None = None  # of a stage: what it does with a recording longer than the memory
 
@@ -262,6 +263,7 @@ def error_model(
     source: str = "",
     typical: str = "",
     pointwise: bool = False,
+    agrees: Callable[[Mapping[str, Any], Any], bool] | None = None,
 ) -> Callable[[F], F]:
     """Mark ``function(x: Excitation, *, settings) -> Terms`` as an error model.
 
@@ -275,11 +277,13 @@ def error_model(
         typical: its usual magnitude, in words.
         pointwise: its regressors at a sample follow from that sample alone, so that its settings are searched on a
             few samples only, without the others being computed.
+        agrees: of settings and fitted coefficients (P,), whether they are what they must be to each other; the loop
+            adopts nothing of which they are not.
     """
     _with_parentheses("error_model", effect)
     return _mark(
         "error_model", name, declares=Declares(tuple(needs)), effect=effect, source=source, typical=typical,
-        pointwise=pointwise,
+        pointwise=pointwise, agrees=agrees,
     )  # fmt: skip
 
 

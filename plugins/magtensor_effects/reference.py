@@ -1,6 +1,7 @@
 """Error models of the reference total field: base station, its clock, its place."""
 
-from typing import Annotated
+from collections.abc import Mapping
+from typing import Annotated, Any
 
 import numpy as np
 from pydantic import Field
@@ -13,6 +14,7 @@ from magtensor.loop.settings import EventTimes, Range
 from magtensor.loop.terms import Terms
 
 NEARBY_S = 2.0  # shorter delays show as the slope over this time
+BETWEEN_NOISE_AND_DELAY = 0.75  # of the lag: half of it is what noise makes, all of it a delay
 
 
 def _total_field(x: Excitation) -> Array:
@@ -37,9 +39,19 @@ def reference_scale(x: Excitation) -> Terms:
     return x.on_reference(0.01 * (f - f.mean()), "%", "excess")
 
 
+def _delayed_by_its_lag(settings: Mapping[str, Any], coefficients: Array) -> bool:
+    """Whether the delay is the lag that the difference was taken over.
+
+    Noise of the base station, slow or fast, seems to be explained by half of that difference, for it is in both.
+    """
+    lag = float(settings["lag_s"])
+    return abs(lag) < NEARBY_S or coefficients[0] / lag > BETWEEN_NOISE_AND_DELAY
+
+
 @error_model(
     "reference",
     needs=("total_field",),
+    agrees=_delayed_by_its_lag,
     source="shift in time",
     typical="a leap second, a time zone, or the station's own filter; 0.1 nT for 1 s in a 10 nT pulsation of 10 min",
 )

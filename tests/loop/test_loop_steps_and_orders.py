@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -81,3 +82,18 @@ def test_what_a_time_constant_leaves_is_another_one_and_no_other_effect(
     found = searched(loaded(tmp_path, scenario(5, *effects)), *VISCOUS)
     assert {a.name for a in found.last.adopted} == {"viscous_magnetisation"}
     np.testing.assert_allclose(sorted(a.settings["tau_s"] for a in found.last.adopted), taus, rtol=0.2)
+
+
+def test_noise_of_the_base_station_is_no_delay_of_it(tmp_path: Path) -> None:
+    # the noise is in the residual and in the difference of two readings: half of that seems to explain it
+    record = loaded(tmp_path, scenario(6))
+    n = len(record.time)
+    spectrum = np.fft.rfft(np.random.default_rng(6).standard_normal(n))
+    noise = np.fft.irfft(spectrum / np.sqrt(np.maximum(np.arange(len(spectrum)), 1)), n)
+    noise *= 1.5 / noise.std()
+    at = record.time
+    noisy = replace(record, total_field=record.total_field + noise, quiet_field=record.quiet_field + noise)
+    late, quiet = (np.interp(at - 40.0, at, values) for values in (record.total_field, record.quiet_field))
+    assert searched(noisy, "reference_clock").last.adopted == ()
+    (adopted,) = searched(replace(record, total_field=late, quiet_field=quiet), "reference_clock").last.adopted
+    np.testing.assert_allclose(adopted.settings["lag_s"], 40.0, atol=10.0)

@@ -17,6 +17,7 @@ from magtensor.calibration.types import Array
 from magtensor.components import Component
 from magtensor.errors import DataError
 from magtensor.loop.assessment import estimated, explained
+from magtensor.loop.evidence import Grams
 from magtensor.loop.excitation import Excitation
 from magtensor.loop.latent import NAME, Sought, renewed, sought, tried_source
 from magtensor.loop.model import Adopted, Fitting, Record, State, joint_state
@@ -26,12 +27,13 @@ from magtensor.loop.screening import ALPHA, Candidate, Scorer, candidates_of, ge
 from magtensor.loop.separation import SEPARATION, fold_gain, separated
 from magtensor.loop.settings import Range
 from magtensor.loop.spectrum import spectral_lines
-from magtensor.loop.statistics import family_p
+from magtensor.loop.statistics import family_p, held_out_gain
 from magtensor.loop.terms import Terms
 from magtensor.loop.trial import Trial, trial
 
 KEEP_ALPHA = 0.01  # an adopted effect that is no longer significant at this level is dropped
 MOST_EFFECTS = 8
+ROUNDING = 1e-4  # mean square of the whitened residual: far below the least noise that any sensor is believed to have
 POLISH = 0.1  # of a setting, to either side
 
 
@@ -113,7 +115,7 @@ def search(
     failed: dict[str, str] = {}
     for _ in range(most_effects + 1):
         state = with_lines(state, record, lines)
-        if len(state.adopted) - len(declared) >= most_effects:
+        if len(state.adopted) - len(declared) >= most_effects or state.residual.square() < ROUNDING:
             break
         taken = {a.name for a in state.adopted}
         open_ = [m for m in testable if m.name not in taken or repeatable(m)]
@@ -202,6 +204,10 @@ def _kept(record: Record, before: Trial, chosen: Candidate, how: Fitting) -> tup
             hurt = before.hurt_by(after)
     if hurt:
         return None, f"fitted, it raises the held-out error of {', '.join(hurt)}"
+    model, theta = after.state.adopted[-1], after.state.theta[-1]
+    agrees = model.component.agrees
+    if agrees is not None and not agrees(model.settings, theta):
+        return None, "fitted, its coefficients are not what its settings assume"
     if not before.likelier(after):
         return None, "fitted together with the others, it leaves more than it takes away"
     return after, ""
@@ -382,15 +388,18 @@ def _slices(state: State) -> list[slice]:
 
 def _significance(state: State, chosen: Sequence[int]) -> float:
     """P value of some of the adopted coefficients, the others free: of the residual with their part put back."""
+    assert state.terms is not None
+    return family_p(_blocks(state), state.terms.sensors, list(chosen))
+
+
+def _blocks(state: State) -> Grams:
+    """Of the adopted terms and the residual with their part put back, in the finest blocks."""
     from magtensor.loop.assessment import block_count
     from magtensor.loop.evidence import grams
 
     assert state.terms is not None
     back = put_back(state.residual, state.terms, np.concatenate(state.theta))
-    blocks = grams(
-        back, state.terms, state.colours.across, state.colours.along, block_count(len(state.residual.affine))
-    )
-    return family_p(blocks, state.terms.sensors, list(chosen))
+    return grams(back, state.terms, state.colours.across, state.colours.along, block_count(len(state.residual.affine)))
 
 
 def put_back(residual: Residual, terms: Terms, theta: Array) -> Residual:
@@ -417,15 +426,18 @@ def _sensors_showing(state: State, which: int) -> tuple[str, ...] | None:
 
 
 def _eliminate(record: Record, state: State, how: Fitting, fixed: int) -> tuple[State, tuple[str, ...]]:
-    """Drop models that no longer earn their place, the weakest first."""
+    """Drop models that no longer earn their place, the weakest first: those that are not significant beside the others,
+    and those without which the others predict held-out blocks as well."""
     dropped: list[str] = []
     while len(state.adopted) > max(fixed, 1):
-        values = [
-            _significance(state, range(part.start, part.stop)) if i >= fixed else 0.0
-            for i, part in enumerate(_slices(state))
-        ]
-        weakest = int(np.argmax(values))
-        if values[weakest] < KEEP_ALPHA:
+        assert state.terms is not None
+        blocks, freedom = _blocks(state), state.residual.freedom
+        parts = _slices(state)[fixed:]
+        values = [family_p(blocks, state.terms.sensors, list(range(p.start, p.stop))) for p in parts]
+        order = np.arange(state.terms.count)
+        gains = [held_out_gain(blocks, freedom, (order < p.start) | (order >= p.stop)).total for p in parts]
+        weakest = fixed + int(np.argmax(values) if max(values) >= KEEP_ALPHA else np.argmin(gains))
+        if max(values) < KEEP_ALPHA and min(gains) > 0:
             break
         dropped.append(state.adopted[weakest].name)
         rest = [i for i in range(len(state.adopted)) if i != weakest]
