@@ -47,7 +47,8 @@ every recipe.
   (samples dense enough for rates of change), `gradient` (a field that differs between the sensors); `a|b` where one of
   two will do.
 - `pointwise=True` says that its regressors at a sample follow from that sample alone; settings with many values are
-  then searched faster.
+  then searched faster. `agrees=function(settings, coefficients)` says whether fitted coefficients are what the settings
+  assume, where both mean one thing; the loop adopts nothing of which they are not.
 
 `check_error_model(my_model)` of `magtensor.loop.checker` gives a list of everything that is wrong with it; put
 `assert check_error_model(my_model) == []` into your tests.

@@ -10,8 +10,9 @@ from magtensor.calibration.types import Array
 from magtensor.components import error_model
 from magtensor.errors import DataError
 from magtensor.loop.excitation import Excitation
-from magtensor.loop.settings import EventTimes, Range
+from magtensor.loop.settings import Range
 from magtensor.loop.terms import Terms
+from magtensor_effects.ageing import EventTime
 
 NEARBY_S = 2.0  # shorter delays show as the slope over this time
 BETWEEN_NOISE_AND_DELAY = 0.75  # of the lag: half of it is what noise makes, all of it a delay
@@ -80,11 +81,7 @@ def reference_clock(
 @error_model(
     "reference", needs=("total_field",), source="shift in level", typical="any: the station's new place", pointwise=True
 )
-def reference_step(
-    x: Excitation,
-    *,
-    time_s: Annotated[float, EventTimes(), Field(description="time of the jump, s since the survey's start")] = 0.0,
-) -> Terms:
+def reference_step(x: Excitation, *, time_s: EventTime = 0.0) -> Terms:
     """The base station was moved or retuned: its total field jumps at a time.
 
     One coefficient. Rival: a jump of all scale factors, which nothing else would tell from it.

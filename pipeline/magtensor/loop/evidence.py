@@ -137,23 +137,15 @@ class Whitened:
         return None if self.r is None else self.along.whiten(_along(self.residual, terms), back=self.over_time)
 
 
-def grams(
-    residual: Residual,
-    terms: Terms | None,
-    across: Colour,
-    along: Colour | TurnedColour,
-    blocks: int = 1,
-    given: Terms | None = None,
-) -> Grams:
+def grams(residual: Residual, terms: Terms, across: Colour, along: Colour | TurnedColour, blocks: int = 1) -> Grams:
     """Gram matrices of terms evaluated at the residual's samples, in contiguous blocks.
 
     Parameters
     ----------
     terms: their series have the residual's samples as rows.
     across, along: the colours of the two parts of the residual.
-    given: terms that come before them.
     """
-    return grams_in(Whitened.of(residual, across, along, given), terms, blocks)
+    return grams_in(Whitened.of(residual, across, along), terms, blocks)
 
 
 def grams_in(white: Whitened, terms: Terms | None, blocks: int = 1) -> Grams:
