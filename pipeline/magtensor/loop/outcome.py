@@ -6,14 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from magtensor.loop.assessment import WHITE, block_count
-from magtensor.loop.evidence import grams
-from magtensor.loop.model import Adopted, Record, State
+from magtensor.loop.model import Adopted, Record
 from magtensor.loop.screening import Candidate, profiled
-from magtensor.loop.search import Search, Step, put_back
+from magtensor.loop.search import Search, Step, removal
 from magtensor.loop.settings import Range
-from magtensor.loop.statistics import held_out_gain
-from magtensor.loop.terms import joined
 from magtensor.loop.waveform import NAME
 
 
@@ -112,20 +108,6 @@ def z_of(p: float) -> float | None:
     from scipy.stats import norm
 
     return float(norm.isf(max(p, 1e-300) / 2.0)) if np.isfinite(p) else None
-
-
-def removal(state: State, index: int) -> tuple[float, float]:
-    """Held-out rms of the residual in nT without and with one of the adopted models, the others in both."""
-    assert state.terms is not None
-    residual = state.residual
-    theta = np.concatenate(state.theta)
-    edges = np.cumsum([0, *(len(t) for t in state.theta)])
-    own = np.zeros(len(theta), dtype=bool)
-    own[edges[index] : edges[index + 1]] = True
-    back = put_back(residual, state.terms, theta)
-    blocks = grams(back, joined([state.terms]), WHITE.across, WHITE.along, block_count(len(residual.affine)))
-    before, after = held_out_gain(blocks, residual.freedom, ~own).rms
-    return before * residual.scale, after * residual.scale
 
 
 def _rejected(found: Search) -> list[dict[str, Any]]:

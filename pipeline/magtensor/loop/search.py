@@ -16,7 +16,7 @@ import numpy as np
 from magtensor.calibration.types import Array
 from magtensor.components import Component
 from magtensor.errors import DataError
-from magtensor.loop.assessment import estimated, explained
+from magtensor.loop.assessment import WHITE, Colours, estimated, explained
 from magtensor.loop.evidence import Grams
 from magtensor.loop.excitation import Excitation
 from magtensor.loop.latent import NAME, Sought, renewed, sought, tried_source
@@ -29,7 +29,7 @@ from magtensor.loop.settings import Range
 from magtensor.loop.spectrum import spectral_lines
 from magtensor.loop.statistics import family_p, held_out_gain
 from magtensor.loop.terms import Terms
-from magtensor.loop.trial import Trial, trial
+from magtensor.loop.trial import WORST_RISE, Trial, trial
 
 KEEP_ALPHA = 0.01  # an adopted effect that is no longer significant at this level is dropped
 MOST_EFFECTS = 8
@@ -392,14 +392,26 @@ def _significance(state: State, chosen: Sequence[int]) -> float:
     return family_p(_blocks(state), state.terms.sensors, list(chosen))
 
 
-def _blocks(state: State) -> Grams:
-    """Of the adopted terms and the residual with their part put back, in the finest blocks."""
+def _blocks(state: State, colours: Colours | None = None) -> Grams:
+    """Of the adopted terms and the residual with their part put back, in the finest blocks, in noise of its own colour
+    or another."""
     from magtensor.loop.assessment import block_count
     from magtensor.loop.evidence import grams
 
     assert state.terms is not None
     back = put_back(state.residual, state.terms, np.concatenate(state.theta))
-    return grams(back, state.terms, state.colours.across, state.colours.along, block_count(len(state.residual.affine)))
+    noise = colours or state.colours
+    return grams(back, state.terms, noise.across, noise.along, block_count(len(state.residual.affine)))
+
+
+def removal(state: State, index: int) -> tuple[float, float]:
+    """Held-out rms of the residual in nT, all noise alike, without and with one of the adopted models, the others in
+    both."""
+    assert state.terms is not None
+    part, order = _slices(state)[index], np.arange(state.terms.count)
+    others = (order < part.start) | (order >= part.stop)
+    before, after = held_out_gain(_blocks(state, WHITE), state.residual.freedom, others).rms
+    return before * state.residual.scale, after * state.residual.scale
 
 
 def put_back(residual: Residual, terms: Terms, theta: Array) -> Residual:
@@ -427,7 +439,7 @@ def _sensors_showing(state: State, which: int) -> tuple[str, ...] | None:
 
 def _eliminate(record: Record, state: State, how: Fitting, fixed: int) -> tuple[State, tuple[str, ...]]:
     """Drop models that no longer earn their place, the weakest first: those that are not significant beside the others,
-    and those without which the others predict held-out blocks as well."""
+    and those without which the others predict held-out blocks as well, or much better if all noise counts alike."""
     dropped: list[str] = []
     while len(state.adopted) > max(fixed, 1):
         assert state.terms is not None
@@ -436,8 +448,14 @@ def _eliminate(record: Record, state: State, how: Fitting, fixed: int) -> tuple[
         values = [family_p(blocks, state.terms.sensors, list(range(p.start, p.stop))) for p in parts]
         order = np.arange(state.terms.count)
         gains = [held_out_gain(blocks, freedom, (order < p.start) | (order >= p.stop)).total for p in parts]
-        weakest = fixed + int(np.argmax(values) if max(values) >= KEEP_ALPHA else np.argmin(gains))
-        if max(values) < KEEP_ALPHA and min(gains) > 0:
+        rises = [after / before for before, after in (removal(state, fixed + i) for i in range(len(parts)))]
+        if max(values) >= KEEP_ALPHA:
+            weakest = fixed + int(np.argmax(values))
+        elif min(gains) <= 0:
+            weakest = fixed + int(np.argmin(gains))
+        elif max(rises) > 1.0 + WORST_RISE:
+            weakest = fixed + int(np.argmax(rises))
+        else:
             break
         dropped.append(state.adopted[weakest].name)
         rest = [i for i in range(len(state.adopted)) if i != weakest]
