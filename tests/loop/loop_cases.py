@@ -104,11 +104,23 @@ def linear_state(record: Record) -> State:
 
 
 def synthetic(
-    seed: int, samples: int = 1200, sensors: int = 4, noise_nT: float = 1.0, added: Array | None = None
+    seed: int,
+    samples: int = 1200,
+    sensors: int = 4,
+    noise_nT: float = 1.0,
+    added: Array | None = None,
+    turning_s: float = 0.0,
 ) -> Record:
-    """A record drawn here, one sample a second: random attitudes, white noise and `added` (N, S, 3) nT."""
+    """A record drawn here, one sample a second: random attitudes, white noise and `added` (N, S, 3) nT.
+
+    With `turning_s` the direction of the field changes slowly, within about so many seconds.
+    """
     rng = np.random.default_rng(seed)
     u = rng.standard_normal((samples, 3))
+    if turning_s:
+        within = np.arange(-4 * turning_s, 4 * turning_s + 1)
+        bell = np.exp(-0.5 * (within / turning_s) ** 2)
+        u = np.column_stack([np.convolve(rng.standard_normal(samples), bell, mode="same") for _ in range(3)])
     total = 50_000.0 + 10.0 * np.sin(np.arange(samples) / 90.0)
     field = u / np.linalg.norm(u, axis=1, keepdims=True) * total[:, None]
     forward = np.eye(3) + 0.01 * rng.standard_normal((sensors, 3, 3))

@@ -20,6 +20,7 @@ _SAME = 1e-3  # chance that the true rotation fits as much worse than the best a
 _ROUGH, _SETTLED = 1e-3, 1e-9  # rad, last step of a search and of the result
 _STEPS = 100
 _APART = float(np.radians(5.0))  # minima nearer to each other are one
+_NOTHING = 1e-12  # of the information about the best known axis: rounding, and no information
 
 
 @dataclass(frozen=True)
@@ -213,17 +214,23 @@ def _minima(
     return found
 
 
+def _known(total: Slope) -> tuple[Array, Array]:
+    """The information (3,) about three axes, least first, zero where rounding alone makes it, and the axes (3, 3)."""
+    values, vectors = np.linalg.eigh(total.information)
+    return np.where(values > _NOTHING * values[-1], values, 0.0), vectors
+
+
 def _uncertainty(total: Slope) -> tuple[Array, Array]:
     """Covariance by the survey's noise, and the response to the calibration's errors; inf where a direction is free."""
-    values, vectors = np.linalg.eigh(total.information)
-    if values[0] <= 0:
+    values, vectors = _known(total)
+    if values[0] == 0:
         return np.full((3, 3), np.inf), np.zeros_like(total.response)
     inverse = (vectors / values) @ vectors.T
     return inverse @ total.scatter @ inverse, -inverse @ total.response
 
 
 def _require_determined(sources: Sequence[Source], total: Slope, covariance: Array, worst: float) -> None:
-    values, vectors = np.linalg.eigh(total.information)
+    values, vectors = _known(total)
     std = np.full(3, np.inf)
     if values[0] > 0:
         std = np.sqrt(np.einsum("ik,ij,jk->k", vectors, covariance, vectors))

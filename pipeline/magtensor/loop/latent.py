@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from magtensor.calibration.types import Array
 from magtensor.components import Component
 from magtensor.loop.assessment import Assessment, estimated
-from magtensor.loop.colour import colour_of
+from magtensor.loop.colour import Colour, colour_of
 from magtensor.loop.direction import attitude_series
 from magtensor.loop.factor import Factors, Groups, noise_alone, with_factor
 from magtensor.loop.log_noise import brought_in
@@ -93,8 +93,8 @@ def sought(state: State, record: Record) -> Sought | None:
     sensors = len(residual.noise) // 3
     told = sensors >= LEAST_SENSORS
     groups: Groups = [np.arange(3 * s, 3 * s + 3) for s in range(sensors)] if told else _outputs(basis)
-    z = residual.across @ basis
-    test = _strongest(state.colours.across.whiten(z), basis, groups)
+    z, colour = _beside_the_field(residual.across @ basis, residual.affine)
+    test = _strongest(colour.whiten(z), basis, groups)
     factors = with_factor(test.covariance, basis, groups, test.alone)
     course = _told_from_the_field(residual, held, factors.direction)
     if course.rms == 0:
@@ -177,12 +177,22 @@ def _told_from_the_field(residual: Residual, held: Array, direction: Array) -> C
     free = free_directions(held)
     seen = free @ (free.T @ direction)
     series = residual.across @ seen / (seen @ seen)
+    left, _ = _beside_the_field(series, residual.affine)
+    return course_of(residual.across + np.outer(left - series, seen), held, direction)
+
+
+def _beside_the_field(series: Array, affine: Array) -> tuple[Array, Colour]:
+    """(N,) or (N, K) without what of it goes with the field, told apart by colour, and the colour of what is left.
+
+    The fit holds its noise for white. Of slow noise, each output's own, its C and o take a part that turns with the
+    field, and so put one waveform into all of them.
+    """
     left = series
     for _ in range(_SETTLING):
-        colour = colour_of(left[:, None])
-        taken = np.linalg.lstsq(colour.whiten(residual.affine), colour.whiten(series), rcond=1e-12)[0]
-        left = series - residual.affine @ taken
-    return course_of(residual.across + np.outer(left - series, seen), held, direction)
+        colour = colour_of(left.reshape(len(left), -1))
+        taken = np.linalg.lstsq(colour.whiten(affine), colour.whiten(series), rcond=1e-12)[0]
+        left = series - affine @ taken
+    return left, colour
 
 
 def renewed(record: Record, state: State, how: Fitting) -> tuple[Record, State]:

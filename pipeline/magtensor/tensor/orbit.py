@@ -27,6 +27,7 @@ _SECOND = np.stack([[(a @ b + b @ a) / 2 for b in GENERATORS] for a in GENERATOR
 
 _CHUNK = 8192
 _STEPS = 30
+_FLAT = 1e-8  # of the largest stretch: a direction in which the surface has shrunk to nothing
 
 
 @dataclass(frozen=True)
@@ -230,12 +231,15 @@ def _rows(direction: Array, g: Array, one: float, by_angle: Array) -> Array:
 
 
 def bent(surface: Surface, found: Feet, normal: Array) -> tuple[Array, Array, Array]:
-    """Tangents (N, 5, 3), inverse of their Gram matrix (N, 3, 3), curvature along the normals (N, 2, 3, 3)."""
+    """Tangents (N, 5, 3), a root of the inverse of their Gram matrix (N, 3, 3), curvature along the normals
+    (N, 2, 3, 3)."""
     tangent = _tangents(surface, found.g)
-    gram = np.matmul(tangent.transpose(0, 2, 1), tangent)
+    _, stretch, turned = np.linalg.svd(tangent, full_matrices=False)
+    stretch = np.maximum(stretch, _FLAT * stretch[:, :1])
+    root = turned.transpose(0, 2, 1) / stretch[:, None, :]
     second = np.matmul(normal.transpose(0, 2, 1), _second_derivatives(surface)).reshape(-1, 2, 9, 5)
     curvature = np.matmul(second, found.g[:, None, :, None]).reshape(-1, 2, 3, 3)
-    return tangent, np.linalg.inv(gram), curvature
+    return tangent, root, curvature
 
 
 def curvature_pull(surface: Surface, found: Feet, normal: Array) -> Array:
@@ -243,8 +247,8 @@ def curvature_pull(surface: Surface, found: Feet, normal: Array) -> Array:
 
     Noise along a bent surface leaves it on the outer side: E[n' r] = -1/2 tr((J'J)^-1 n' f'') sigma^2.
     """
-    _, inverse, curvature = bent(surface, found, normal)
-    out: Array = -0.5 * np.einsum("nab,nkab->nk", inverse, curvature)
+    _, root, curvature = bent(surface, found, normal)
+    out: Array = -0.5 * np.einsum("nab,nkab->nk", np.matmul(root, root.transpose(0, 2, 1)), curvature)
     return out
 
 
@@ -258,8 +262,8 @@ def noise_information(surface: Surface, found: Feet, normal: Array) -> Array:
     for start in range(0, len(found.g), _CHUNK):
         part = slice(start, start + _CHUNK)
         piece = Feet(found.rotation[part], found.g[part], found.across[part], found.residual[part])
-        tangent, inverse, curvature = bent(surface, piece, normal[part])
-        factor = np.linalg.cholesky(inverse)
+        tangent, root, curvature = bent(surface, piece, normal[part])
+        inverse = np.matmul(root, root.transpose(0, 2, 1))
         drawn = np.matmul(np.matmul(tangent, inverse), curvature.transpose(0, 2, 1, 3).reshape(-1, 3, 6))
         drawn = drawn.reshape(-1, 5, 2, 3)
         by_angle = piece.across @ surface.mixing.T
@@ -269,6 +273,6 @@ def noise_information(surface: Surface, found: Feet, normal: Array) -> Array:
             for d, k in enumerate(GENERATORS)
         ]
         for column in range(3):
-            rows = sum(np.repeat(factor[:, d, column], 2)[:, None] * moved[d] for d in range(column, 3))
+            rows = sum(np.repeat(root[:, d, column], 2)[:, None] * moved[d] for d in range(3))
             out += np.asarray(rows).T @ np.asarray(rows)
     return out

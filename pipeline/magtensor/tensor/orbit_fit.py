@@ -33,6 +33,7 @@ _SEARCHED = 2000  # readings that the search from a far start looks at; all of t
 _STEPS = 60
 _LEAST_DAMPING = 1e-9
 _ROUNDING = 1e-20  # the least noise variance assumed, of readings of order one
+_SAME_SHAPE = 1e-6  # rad: angles of shapes are arc cosines, and rounding makes 1e-8 of them
 _FALSE_ALARM = 1e-4
 _SHAPES = (0.35, 0.7)  # rad, tried for a source of unknown shape: neither is axisymmetric
 
@@ -220,7 +221,8 @@ def determination(here: Likelihood) -> Determination:
     count, freedom = len(here.off) // 2, len(here.off) - len(here.columns) + 3
     needed = max(LEAST_INFORMATION, float(fdtri(count, freedom, 1 - _FALSE_ALARM)))
     size = abs(float(np.linalg.det(here.surface.mixing))) ** 0.2
-    narrowest = size * smallest_radius(here.surface.angle) / float(np.sqrt(here.variance))
+    blur = max(float(np.sqrt(here.variance)), _SAME_SHAPE * size)
+    narrowest = size * smallest_radius(here.surface.angle) / blur
     if narrowest < 1:
         return Determination(0.0, needed, 0, narrowest)
     noise = here.across_gauge(_noise_information(here)) * here.variance
