@@ -1,12 +1,12 @@
 """The joint fit without a reference, of several surveys, and with an attitude, against the bound that noise sets.
 
 `python studies/joint_surveys.py` prints the tables of docs/joint_surveys.md. Surveys are those of
-tests/joint/several_cases.py (the array of METHODS A4.8, 1 nT of noise, without the product's simulator). The first
-column of figures, error over bound, is the rms error of all parameters of all surveys, measured by the Cramer-Rao
-information and over the number of determined parameters: 1 at the bound. The information is computed there from the
-true parameters, sample by sample, with the unknown direction of each field projected off, and its size where that is
-an unknown constant. Behind it stands its standard error. Standardised errors are over the standard deviations that
-the fit states, all parameters pooled.
+tests/joint/several_cases.py and changing_cases.py (the array of METHODS A4.8, 1 nT of noise, without the product's
+simulator). The first column of figures, error over bound, is the rms error of all parameters of all surveys, measured
+by the Cramer-Rao information and over the number of determined parameters: 1 at the bound. The information is computed
+there from the true parameters, sample by sample, with the unknown direction of each field projected off, and its size
+where that is an unknown constant. Behind it stands its standard error. Standardised errors are over the standard
+deviations that the fit states, all parameters pooled.
 """
 
 from __future__ import annotations
@@ -20,9 +20,11 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests/joint"))
 
-from several_cases import Case, errors, surveys
+import changing_cases
+import several_cases
+from several_cases import Case
 
-CASES: dict[str, Sequence[tuple[str, Case]]] = {
+CASES: dict[str, Sequence[tuple[str, Case | changing_cases.Case]]] = {
     "Without a scalar reference": [
         (f"{s} sensor{'s' * (s > 1)}, {words}, {n} samples, {g} unknown constant{'s' * (g > 1)}",
          Case(samples=(n,), sensors=s, tilt_deg=tilt, levels=g))
@@ -45,6 +47,26 @@ CASES: dict[str, Sequence[tuple[str, Case]]] = {
         ("4 sensors, 3 x 150, any attitude, a constant field unknown in each",
          Case(samples=(150,) * 3, levels=1)),
     ],
+    "Several surveys whose C changes with the date": [
+        (words, changing_cases.Case(samples=samples, years=years, **options))
+        for words, samples, years, options in (
+            ("4 sensors, 150 + 100 + 100 + 50 in 2.5 years, any attitude, own offsets",
+             (150, 100, 100, 50), (0.0, 0.4, 1.1, 2.5), {}),
+            ("4 sensors, the same, +-20 deg, own offsets",
+             (150, 100, 100, 50), (0.0, 0.4, 1.1, 2.5), {"tilt_deg": 20.0}),
+            ("4 sensors, the same, +-40 deg, common offsets",
+             (150, 100, 100, 50), (0.0, 0.4, 1.1, 2.5), {"tilt_deg": 40.0, "offsets": "common"}),
+            ("4 sensors, the same, +-40 deg, offsets linear in the date",
+             (150, 100, 100, 50), (0.0, 0.4, 1.1, 2.5), {"tilt_deg": 40.0, "offsets": "linear"}),
+            ("4 sensors, 200 + 200 a year apart, any attitude, own offsets", (200, 200), (0.0, 1.0), {}),
+            ("4 sensors, 6 x 8 postures in 5 years, any attitude, common offsets",
+             (8,) * 6, tuple(range(6)), {"offsets": "common"}),
+            ("1 sensor, 200 + 200 + 200 in 2 years, +-40 deg, own offsets",
+             (200,) * 3, (0.0, 1.0, 2.0), {"sensors": 1, "tilt_deg": 40.0}),
+            ("4 sensors, 3 x 150, +-40 deg, own offsets, attitude to 0.1 deg",
+             (150,) * 3, (0.0, 1.0, 2.0), {"tilt_deg": 40.0, "attitude_deg": 0.1}),
+        )
+    ],
     "With an attitude and a known field": [
         (f"{s} sensor{'s' * (s > 1)}, {n} samples, {words}, attitude to {deg:g} deg",
          Case(samples=(n,), sensors=s, tilt_deg=tilt, attitude_deg=deg))
@@ -57,13 +79,20 @@ CASES: dict[str, Sequence[tuple[str, Case]]] = {
 }  # fmt: skip
 
 
-def table(name: str, cases: Sequence[tuple[str, Case]], runs: int) -> None:
+def errors_of(seed: int, case: Case | changing_cases.Case) -> several_cases.Errors:
+    """Of one draw."""
+    if isinstance(case, changing_cases.Case):
+        return changing_cases.errors(changing_cases.surveys(seed, case))
+    return several_cases.errors(several_cases.surveys(seed, case))
+
+
+def table(name: str, cases: Sequence[tuple[str, Case | changing_cases.Case]], runs: int) -> None:
     """Print one table."""
     print(f"## {name}\n")
     print("| case | fits | error / bound | variance of standardised errors | inside 95 % | Mahalanobis / rank |")
     print("|---|---|---|---|---|---|", flush=True)
     for words, case in cases:
-        found = [errors(surveys(seed, case)) for seed in range(runs)]
+        found = [errors_of(seed, case) for seed in range(runs)]
         pooled = np.array([f.standardised for f in found])
         by_bound = np.array([f.by_bound for f in found])
         ratio = np.sqrt(by_bound.mean())
@@ -80,9 +109,11 @@ def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--runs", type=int, default=200)
+    parser.add_argument("--table", choices=list(CASES), help="one of them alone")
     chosen = parser.parse_args()
     for name, cases in CASES.items():
-        table(name, cases, chosen.runs)
+        if chosen.table in (None, name):
+            table(name, cases, chosen.runs)
 
 
 if __name__ == "__main__":

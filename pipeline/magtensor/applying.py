@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -64,6 +66,7 @@ def apply(
         require_writable(file.parent)
     if memory_GiB is not None and (refine_rotation or save_calibration is not None):
         raise UsageError("the common rotation is refined on the whole survey: leave --memory out")
+    from magtensor.dated import change_at_date_of
     from magtensor.platform_frame import calibration_variables
 
     stored = result.open_result(calibration)
@@ -82,11 +85,11 @@ def apply(
     result.write_calibrated(target, found, applied)
     if save_calibration is not None:
         if turned is not None:
-            stored = stored.merged(calibration_variables(stored, result.sensors_of(stored), turned))
+            own = change_at_date_of(found, stored, turned.calibration)
+            stored = stored.merged(calibration_variables(stored, result.sensors_of(stored), turned) | own)
         result.write_calibration(save_calibration, stored, applied)
     words = str(found["calibrated/b"].attrs["rotation_refined"]) if refine_rotation else ""
-    offsets = found["calibrated/b"].attrs.get("offset_of") if "calibrated/b" in found else None
-    told = f" Offsets: {offsets}." if offsets else ""
+    told = _told(found["calibrated/b"].attrs) if "calibrated/b" in found else ""
     left = str(found["calibrated/b"].attrs.get("not_taken_off", "")) if "calibrated/b" in found else ""
     notes = (*summary(found.flags), *([f"NOT taken off: {left}"] if left else []))
     return Applied(target, fit_in_words(survey_block(found)) + told, words, notes)
@@ -111,11 +114,20 @@ def apply_to(
     rows: slice | None = None,
     uniform: bool = False,
     judge: bool = True,
+    date: datetime | None = None,
 ) -> Survey:
     """Another survey, loaded as the recipe loads and corrected with a calibration; the options as in
     `apply_and_refine`."""
     return apply_and_refine(
-        calibration, path, planned, tolerant=tolerant, rows=rows, refine_rotation=False, uniform=uniform, judge=judge
+        calibration,
+        path,
+        planned,
+        tolerant=tolerant,
+        rows=rows,
+        refine_rotation=False,
+        uniform=uniform,
+        judge=judge,
+        date=date,
     )[0]
 
 
@@ -129,6 +141,7 @@ def apply_and_refine(
     rows: slice | None = None,
     uniform: bool = False,
     judge: bool = True,
+    date: datetime | None = None,
 ) -> tuple[Survey, Tied | None]:
     """Another survey, loaded as the recipe loads and corrected with a calibration.
 
@@ -138,12 +151,14 @@ def apply_and_refine(
         uniform: its field is known to be uniform.
         judge: flag the samples that stand out alone (`standing_out`); the attribute `not_taken_off` of `calibrated/b`
             names effects that cannot be taken off this survey.
+        date: that a calibration which changes with time is brought to; the survey's when None.
 
     Returns:
         The survey, and the calibration in its new frame: None where no turn was asked for or is significant. The
         attribute `rotation_refined` of `calibrated/b` says what was done.
     """
     from magtensor.calibrated import corrected, require_positions, require_sensors, restored
+    from magtensor.dated import at_date_of
     from magtensor.effect_errors import taken_off
     from magtensor.loop.stored import cleaned, left_in, on_its_clock, stored_effects
     from magtensor.platform_frame import as_fitted, with_refined_rotation
@@ -158,14 +173,14 @@ def apply_and_refine(
         require_sensors(survey, result.sensors_of(calibration), str(path))
         if "calibration/position" in calibration:
             require_positions(survey, calibration.values("calibration/position"), str(path))
-        fitted = restored(calibration)
+        fitted, dated = at_date_of(survey, calibration, restored(calibration), date)
         adopted, theta, means = stored_effects(calibration, planned.registry)
         adopted = on_its_clock(adopted, calibration, survey)
         before, survey = survey, cleaned(survey, as_fitted(calibration, fitted), adopted, theta, means)
         if judge:
             known = calibration.values("calibration/noise_std") if "calibration/noise_std" in calibration else None
             survey = flagged(survey, fitted, known, uniform=uniform)
-        survey = survey.merged(_named(corrected(fitted, survey, left_in(survey, adopted)), calibration))
+        survey = survey.merged(_named(corrected(fitted, survey, left_in(survey, adopted)), calibration, dated))
         if refine_rotation:
             survey, turned = with_refined_rotation(survey, calibration, fitted)
             fitted = turned.calibration if turned is not None else fitted
@@ -191,13 +206,18 @@ def apply_and_refine(
     return survey, turned
 
 
-def _named(given: dict[str, Variable], calibration: Survey) -> dict[str, Variable]:
-    """The variables of a calibrated survey, with the words that say whose offsets were taken off."""
-    words = calibration["calibration/matrix"].attrs.get("offset_of")
-    if not words:
-        return given
+def _named(given: dict[str, Variable], calibration: Survey, dated: str) -> dict[str, Variable]:
+    """The variables of a calibrated survey, with the words that say whose offsets were taken off, and the date that the
+    calibration was brought to."""
+    words = {"offset_of": calibration["calibration/matrix"].attrs.get("offset_of"), "calibration_date": dated}
     dims, values, attributes = given["calibrated/b"]
-    return given | {"calibrated/b": (dims, values, dict(attributes) | {"offset_of": words})}
+    return given | {"calibrated/b": (dims, values, dict(attributes) | {k: v for k, v in words.items() if v})}
+
+
+def _told(attributes: Mapping[str, Any]) -> str:
+    """The same words, of a calibrated survey's `calibrated/b`, after a sentence."""
+    dated, offsets = (attributes.get(name) for name in ("calibration_date", "offset_of"))
+    return (f" Calibration: {dated}." if dated else "") + (f" Offsets: {offsets}." if offsets else "")
 
 
 def verification(calibrated: Survey, path: Path | Held, planned: Plan) -> dict[str, Any]:

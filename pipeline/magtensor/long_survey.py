@@ -15,6 +15,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from datetime import datetime
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
@@ -27,6 +28,7 @@ from magtensor.applying import Applied, apply_to, fit_in_words, verification
 from magtensor.atomic import atomic_path, atomic_set
 from magtensor.calibrated import contrasts, left_open
 from magtensor.calibration.recording import even_blocks
+from magtensor.dated import RATE, date_of
 from magtensor.errors import DataError, UsageError
 from magtensor.preparing import load_as, preparing_stages
 from magtensor.provenance import Provenance
@@ -159,10 +161,13 @@ def apply_long(
     _require_no_memory(stored)
     blocks: list[tuple[int, dict[str, Any] | None]] = []
     flags: list[Flag] = []
+    date: datetime | None = None
 
     def parts() -> Iterator[xr.DataTree]:
+        nonlocal date
         for rows in windows(replace(planned, survey=planned.survey_for(survey)).source(), memory_GiB):
-            found = apply_to(stored, survey, planned, tolerant=True, rows=rows)
+            found = apply_to(stored, survey, planned, tolerant=True, rows=rows, date=date)
+            date = date_of(found) if date is None and RATE in stored else date
             block = survey_block(found)
             blocks.append((int(block["samples"]) if block else 0, block))
             flags.extend(found.flags)

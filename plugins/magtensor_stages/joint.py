@@ -15,6 +15,7 @@ from magtensor.components import Component, Declares
 from magtensor.survey.flags import flag_ranges
 from magtensor_methods.scalar_options import WorstError
 from magtensor_stages import joint_surveys
+from magtensor_stages.joint_changing import changing_with_date
 from magtensor_stages.sensors import COMMON, common_frame, naming
 
 if TYPE_CHECKING:
@@ -47,8 +48,19 @@ AttitudeStd = Annotated[
     float | None,
     Field(gt=0, lt=30, description="standard deviation of the attitude about each axis, deg; default: from the data"),
 ]
+MatricesOf = Annotated[
+    Literal["common", "linear"],
+    Field(
+        description="with further surveys: all share one C (scale factors and angles), or C changes linearly with the "
+        "date of the survey; `magtensor apply` then takes the date of the survey that it is applied to"
+    ),
+]
 OffsetsOf = Annotated[
-    Literal["own", "common"], Field(description="with further surveys: each has its own offsets, or all share one")
+    Literal["own", "common", "linear"],
+    Field(
+        description="with further surveys: each has its own offsets, or all share one, or offsets change linearly with "
+        "the date"
+    ),
 ]
 OffsetTaken = Annotated[
     Literal["this", "mean"],
@@ -62,6 +74,11 @@ OffsetTaken = Annotated[
 ALONE = (
     "calibrate_joint: error_models are fitted to one survey with a measured total field and without a vector reference"
 )
+DATED = "calibrate_joint: {}: linear needs further surveys (survey: {{with: [...]}}), at other dates"
+UNMEASURED = (
+    "calibrate_joint: a change with the date needs a measured total field; one that is unknown in each survey hides a "
+    "change of all sensitivities"
+)
 MEAN_OF_OWN = "calibrate_joint: offset_of: mean needs further surveys with offsets of their own"
 
 
@@ -72,7 +89,7 @@ def declares(options: Mapping[str, Any], *, several: bool = False) -> Declares:
         UsageError: options contradict each other.
     """
     field = _field(options["total_field"], options["total_field_nT"], options["vector_reference"])
-    together = (options[name] for name in ("attitude_std_deg", "offsets", "offset_of", "error_models"))
+    together = (options[name] for name in ("attitude_std_deg", "matrices", "offsets", "offset_of", "error_models"))
     _require_agreement(field, *together, several=several)
     needs = ["b_raw", "total_field"] if field.measured and not field.vector else ["b_raw"]
     needs += ["segment"] if field.kind == "per_segment" else []
@@ -93,6 +110,7 @@ def declares(options: Mapping[str, Any], *, several: bool = False) -> Declares:
 def _require_agreement(
     field: joint_surveys.Field,
     attitude_std_deg: float | None,
+    matrices: str,
     offsets: str,
     offset_of: str,
     error_models: object,
@@ -101,7 +119,12 @@ def _require_agreement(
 ) -> None:
     if attitude_std_deg is not None and not field.vector:
         raise UsageError("calibrate_joint: attitude_std_deg needs vector_reference: true; no attitude is used without")
-    if offset_of == "mean" and (offsets == "common" or not several):
+    for name, value in (("matrices", matrices), ("offsets", offsets)):
+        if value == "linear" and not several:
+            raise UsageError(DATED.format(name))
+        if value == "linear" and not field.measured:
+            raise UsageError(UNMEASURED)
+    if offset_of == "mean" and (offsets != "own" or not several):
         raise UsageError(MEAN_OF_OWN)
     if error_models and (field.vector or not field.measured or several):
         raise UsageError(ALONE)
@@ -134,7 +157,7 @@ def calibrate_recording(
 
 _PLAIN: dict[str, Any] = {
     "total_field": "measured", "total_field_nT": None, "vector_reference": False, "attitude_std_deg": None,
-    "offsets": "own", "offset_of": "this", "error_models": {},
+    "matrices": "common", "offsets": "own", "offset_of": "this", "error_models": {},
 }  # fmt: skip
 
 
@@ -149,6 +172,7 @@ def calibrate_joint(
     total_field_nT: DeclaredField = None,
     vector_reference: VectorReference = False,
     attitude_std_deg: AttitudeStd = None,
+    matrices: MatricesOf = "common",
     offsets: OffsetsOf = "own",
     offset_of: OffsetTaken = "this",
     error_models: ErrorModelsChoice = (),
@@ -166,7 +190,7 @@ def calibrate_joint(
 
     field = _field(total_field, total_field_nT, vector_reference)
     several = survey.source is not None and bool(survey.source.further_files())
-    _require_agreement(field, attitude_std_deg, offsets, offset_of, error_models, several=several)
+    _require_agreement(field, attitude_std_deg, matrices, offsets, offset_of, error_models, several=several)
     if total_field == "measured" and total_field_nT is not None and joint_surveys.has_measured_field(survey):
         raise UsageError(
             f"calibrate_joint: total_field_nT: {total_field_nT:g} would put the survey's measured total field aside; "
@@ -176,7 +200,10 @@ def calibrate_joint(
         return _with_error_models(survey, dict(error_models), reference_noise_nT, robust, worst_error)
     if several or field.vector or field.kind.startswith("per_"):
         how = (reference_noise_nT, attitude_std_deg, robust, worst_error)
-        calibration, extra, doubted = _from_surveys(survey, field, how, offsets == "common", offset_of == "mean")
+        if "linear" in (matrices, offsets):
+            calibration, extra, doubted = changing_with_date(survey, field, how, matrices, offsets, offset_of == "mean")
+        else:
+            calibration, extra, doubted = _from_surveys(survey, field, how, offsets == "common", offset_of == "mean")
     else:
         where = str(survey.attributes.get("source", ""))
         usable = joint_surveys.usable_samples(survey, field, where)
@@ -298,12 +325,11 @@ def _from_surveys(
     mean: bool,
 ) -> tuple[ArrayCalibration, dict[str, Any], np.ndarray]:
     """The calibration, what else is told of it, and the samples (N,) of this survey that no noise explains."""
-    from magtensor.calibration.common_scale import COMMON_SCALE
     from magtensor.calibration.surveys.corrections import calibrated_surveys
     from magtensor.calibration.surveys.fit import fit_surveys
 
     reference_noise, attitude_std_deg, robust, worst_error = how
-    names, uses, samples = joint_surveys.gathered(survey, field)
+    names, uses, samples = joint_surveys.gathered(joint_surveys.named_surveys(survey), field)
     with naming(survey):
         fit = fit_surveys(
             samples,
@@ -319,13 +345,9 @@ def _from_surveys(
     if not field.measured:
         calibration, factor = _without_reference(calibration, field, float(np.mean(fit.found.sums.total_field)))
         found = found if field.declared is not None else found.nominal()
-    elif field.vector and ("total_field" not in survey or survey["total_field"].attrs.get("origin") == "constant"):
-        words = f"{COMMON_SCALE}: the size of the world field was declared, not measured"
-        calibration = replace(calibration, unobservable=(*calibration.unobservable, words))
+    else:
+        calibration = joint_surveys.with_declared_size(survey, field, calibration)
     extra = joint_surveys.survey_variables(names, fit, found, survey.sensors, factor)
-    if words := joint_surveys.offset_words(names, found, mean):
+    if words := joint_surveys.offset_words(names, found.offset, mean):
         extra["offset_of"] = words
-    doubted = np.zeros(len(survey.time), dtype=bool)
-    own = np.flatnonzero(uses[0])
-    doubted[own[~fit.keep[: len(own)]]] = True
-    return calibration, extra, doubted
+    return calibration, extra, joint_surveys.doubted_in(survey, uses[0], fit.keep)

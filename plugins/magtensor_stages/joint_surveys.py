@@ -15,7 +15,8 @@ if TYPE_CHECKING:
     from magtensor.calibration.surveys.corrections import SurveysCalibration
     from magtensor.calibration.surveys.fit import SurveysFit
     from magtensor.calibration.surveys.samples import Samples
-    from magtensor.survey.model import Survey
+    from magtensor.calibration.types import ArrayCalibration
+    from magtensor.survey.model import Survey, Variable
 
 
 @dataclass(frozen=True)
@@ -97,13 +98,18 @@ def samples_of(survey: Survey, use: np.ndarray, field: Field) -> Samples:
     return Samples(raw, total_field, runs(survey.time, segment)[use], none, level, direction)
 
 
-def gathered(survey: Survey, field: Field) -> tuple[list[str], list[np.ndarray], Samples]:
+def named_surveys(survey: Survey) -> list[tuple[str, Survey]]:
+    """This survey and the further ones that its recipe names."""
+    further = survey.source.further_surveys() if survey.source is not None else []
+    own = str(survey.attributes.get("source", ""))
+    return [(own.rsplit("/", 1)[-1] or "this survey", survey), *further]
+
+
+def gathered(surveys: Sequence[tuple[str, Survey]], field: Field) -> tuple[list[str], list[np.ndarray], Samples]:
     """Names of all surveys, which samples of each are used, and those samples."""
     from magtensor.calibration.surveys.samples import joined
 
-    further = survey.source.further_surveys() if survey.source is not None else []
-    own = str(survey.attributes.get("source", ""))
-    surveys = [(own.rsplit("/", 1)[-1] or "this survey", survey), *further]
+    survey = surveys[0][1]
     names, uses, parts = [], [], []
     for i, (name, one) in enumerate(surveys):
         for _, other in surveys[:i]:
@@ -120,14 +126,37 @@ def gathered(survey: Survey, field: Field) -> tuple[list[str], list[np.ndarray],
     return names, uses, joined(parts)
 
 
-def offset_words(names: Sequence[str], calibration: SurveysCalibration, mean: bool) -> str:
-    """Whose offsets a calibration holds, and how far those of the surveys lie apart."""
-    count = len(calibration.offset)
+def with_declared_size(survey: Survey, field: Field, calibration: ArrayCalibration) -> ArrayCalibration:
+    """The calibration that says so where the size of the field is the world field's, which somebody gave."""
+    from magtensor.calibration.common_scale import COMMON_SCALE
+
+    if not field.vector or has_measured_size(survey):
+        return calibration
+    words = f"{COMMON_SCALE}: the size of the world field was declared, not measured"
+    return replace(calibration, unobservable=(*calibration.unobservable, words))
+
+
+def has_measured_size(survey: Survey) -> bool:
+    """Whether the total field at the samples was measured."""
+    return "total_field" in survey and survey["total_field"].attrs.get("origin") != "constant"
+
+
+def doubted_in(survey: Survey, used: np.ndarray, keep: np.ndarray) -> np.ndarray:
+    """(N,) samples of a survey that a fit left out, of those used (N,) in it; it is the first of the samples kept."""
+    doubted = np.zeros(len(survey.time), dtype=bool)
+    own = np.flatnonzero(used)
+    doubted[own[~keep[: len(own)]]] = True
+    return doubted
+
+
+def offset_words(names: Sequence[str], offset: np.ndarray, mean: bool) -> str:
+    """Whose offsets a calibration holds, and how far those of the surveys, (K, S, 3) nT, lie apart."""
+    count = len(offset)
     if len(names) == 1:
         return ""
     if count == 1:
         return f"one for all of the {len(names)} surveys fitted"
-    apart = float(np.sqrt(np.mean(np.var(calibration.offset, axis=0, ddof=1))))
+    apart = float(np.sqrt(np.mean(np.var(offset, axis=0, ddof=1))))
     scatter = f"they scatter by {apart:.3g} nT between the {count} surveys"
     if mean:
         return f"the mean of {', '.join(names)}; {scatter}, which their standard deviations hold"
@@ -147,14 +176,24 @@ def survey_variables(
         given["calibration/total_field"] = (("level",), fit.found.sums.total_field[first] * factor, attributes)
     if len(names) == 1 or len(calibration.offset) == 1:
         return given
+    given["calibration/survey"] = survey_names(names)
+    return given | offset_variables(names, sensors, calibration.offset, calibration.covariance, calibration.common)
+
+
+def survey_names(names: Sequence[str]) -> Variable:
+    """The surveys of a fit."""
+    return ("survey",), np.array(names), {"long_name": "surveys fitted together"}
+
+
+def offset_variables(
+    names: Sequence[str], sensors: list[str], offset: np.ndarray, covariance: np.ndarray, common: ArrayCalibration
+) -> dict[str, Any]:
+    """The offsets (K, S, 3) nT of every survey, and the covariance of this survey's matrices and all offsets."""
     elements = [f"{s}:matrix_{i}{j}" for s in sensors for i in "xyz" for j in "xyz"]
     parameters = elements + [f"{n}:{s}:offset_{j}" for n in names for s in sensors for j in "xyz"]
-    facts = {"units": "products of the parameters' units (1, nT)", "frame": calibration.common.frame}
-    return given | {
-        "calibration/survey": (("survey",), np.array(names), {"long_name": "surveys fitted together"}),
-        "calibration/survey_offset": (("survey", "sensor", "raw_axis"), calibration.offset, {"units": "nT"}),
+    facts = {"units": "products of the parameters' units (1, nT)", "frame": common.frame}
+    return {
+        "calibration/survey_offset": (("survey", "sensor", "raw_axis"), offset, {"units": "nT"}),
         "calibration/survey_parameter": (("survey_parameter",), np.array(parameters), {}),
-        "calibration/survey_covariance": (
-            ("survey_parameter", "survey_parameter_"), calibration.covariance, facts,
-        ),
-    }  # fmt: skip
+        "calibration/survey_covariance": (("survey_parameter", "survey_parameter_"), covariance, facts),
+    }

@@ -50,6 +50,9 @@ def written(
     reference: bool = False,
     attitude_deg: float | None = None,
     levels: int = 1,
+    forward: np.ndarray = FORWARD,
+    offset: np.ndarray = OFFSET,
+    date: str = "2026-01-01",
 ) -> np.ndarray:
     """A canonical survey of the array above; the true field (N, 3) in the platform's frame."""
     rng = np.random.default_rng(seed)
@@ -57,9 +60,9 @@ def written(
     segment = np.arange(samples) * levels // samples
     size = (FIELD_NT + (200.0 * rng.standard_normal(levels) if levels > 1 else np.zeros(1)))[segment]
     field = np.einsum("nji,j->ni", to_world(q), WORLD / FIELD_NT) * size[:, None]
-    offset = OFFSET + apart_nT * rng.standard_normal(OFFSET.shape)
-    raw = np.einsum("sij,nj->nsi", FORWARD, field) + offset + NOISE_NT * rng.standard_normal((samples, SENSORS, 3))
-    epoch = "seconds since 2026-01-01T00:00:00Z"
+    offset = offset + apart_nT * rng.standard_normal(OFFSET.shape)
+    raw = np.einsum("sij,nj->nsi", forward, field) + offset + NOISE_NT * rng.standard_normal((samples, SENSORS, 3))
+    epoch = f"seconds since {date}T00:00:00Z"
     content = {"time": (time, epoch), "b_raw": (raw, "nT"), "position": (POSITION, "m"), "segment": (segment, "1")}
     if reference:
         content |= {"reference/time": (time[::10], epoch), "reference/total_field": (size[::10], "nT")}

@@ -7,11 +7,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from magtensor.calibration.common_scale import nominal, nominal_scale
-from magtensor.calibration.joint import diagnostics, nearest_frame
+from magtensor.calibration.joint import diagnostics
 from magtensor.calibration.types import Array, ArrayCalibration
 
-from .covariance import forward_covariance, to_corrections, with_offset
-from .fit import SurveysFit
+from .covariance import covariance_of, to_corrections, with_offset
+from .fit import SurveysFit, frame_of
 
 
 @dataclass(frozen=True)
@@ -38,9 +38,7 @@ class SurveysCalibration:
         between the surveys is then part of their covariance."""
         count = len(self.offset)
         weights = np.full(count, 1.0 / count)
-        away = (self.offset - self.offset.mean(axis=0)).reshape(count, -1)
-        scatter = away.T @ away / (count - 1) * (1 + 1 / count) if count > 1 else np.zeros((0, 0))
-        return self._with(weights, scatter)
+        return self._with(weights, scatter_of(self.offset.reshape(count, -1)) if count > 1 else np.zeros((0, 0)))
 
     def nominal(self) -> SurveysCalibration:
         """The same with nominal mean sensitivity (`common_scale`), where no total field was measured."""
@@ -61,21 +59,35 @@ class SurveysCalibration:
         return replace(self.common, offset=offset, covariance=covariance)
 
 
+def scatter_of(offset: Array) -> Array:
+    """(3 S, 3 S) nT^2: by how much the offsets of a further survey scatter about the mean of K surveys' (K, 3 S)."""
+    count = len(offset)
+    away = offset - offset.mean(axis=0)
+    out: Array = away.T @ away / (count - 1) * (1 + 1 / count)
+    return out
+
+
+def frame_words(fit: SurveysFit) -> tuple[str, tuple[str, ...], dict[str, float | str]]:
+    """The frame of a fit, what it leaves unobservable, and what it says of an attitude."""
+    if fit.attitude_std is None:
+        free = ("one rotation of the whole array: the frame nearest to the raw axes was chosen",)
+        return "array (nearest to the raw axes)", free, {}
+    told: dict[str, float | str] = {
+        "attitude_std_deg": float(np.degrees(fit.attitude_std)),
+        "attitude_excess": fit.attitude_excess,
+    }
+    return "platform (by the attitude and the known field)", (), told
+
+
 def calibrated_surveys(fit: SurveysFit) -> SurveysCalibration:
     """The fit in its frame: nearest to the raw axes, or the platform's where directions are known."""
-    sighted = fit.attitude_std is not None
-    q = np.eye(3) if sighted else nearest_frame(fit.forward)
-    forward = fit.forward @ q
+    forward = fit.forward @ frame_of(fit.forward, fit.attitude_std is not None)
     matrix: Array = np.asarray(np.linalg.inv(forward), dtype=np.float64)
-    chain = to_corrections(matrix, len(fit.offset))
-    covariance = chain @ forward_covariance(fit, forward, q) @ chain.T
+    chain = np.eye(fit.design.size)
+    chain[: 9 * len(matrix), : 9 * len(matrix)] = to_corrections(matrix)
+    covariance = chain @ covariance_of(fit.design, fit.said, fit.chi2_along) @ chain.T
     told = diagnostics(fit.keep, fit.chi2_along, fit.plane, fit.coverage, matrix)
-    frame = "array (nearest to the raw axes)"
-    free: tuple[str, ...] = ("one rotation of the whole array: the frame nearest to the raw axes was chosen",)
-    if fit.attitude_std is not None:
-        told["attitude_std_deg"] = float(np.degrees(fit.attitude_std))
-        told["attitude_excess"] = fit.attitude_excess
-        frame, free = "platform (by the attitude and the known field)", ()
+    frame, free, more = frame_words(fit)
     with_first = with_offset(len(matrix), np.eye(len(fit.offset))[0])
-    common = ArrayCalibration(matrix, fit.offset[0], with_first @ covariance @ with_first.T, frame, free, told)
+    common = ArrayCalibration(matrix, fit.offset[0], with_first @ covariance @ with_first.T, frame, free, told | more)
     return SurveysCalibration(common, fit.offset, covariance)

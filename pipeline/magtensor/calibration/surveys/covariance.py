@@ -1,73 +1,62 @@
-"""The covariance of one C and the offsets of several surveys, in the frame of the calibration."""
+"""The covariance of the parameters of several surveys, in the frame of the calibration."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
-from magtensor.calibration.joint_covariance import SYMMETRIC as _PLACES
-from magtensor.calibration.joint_covariance import frame_projection
 from magtensor.calibration.types import Array
 
-from .fit import SurveysFit
-from .sums import SYMMETRIC
+from .design import Design, inverse_in, summed_up
+from .said import Said
 
 
-def forward_covariance(fit: SurveysFit, forward: Array, q: Array) -> Array:
-    """Covariance of C Q (9 S, sensor after sensor, row by row), then of the offsets (3 S K, survey after survey).
+def covariance_of(design: Design, surveys: Sequence[Said], chi2_along: float, scatter: float = 0.0) -> Array:
+    """Covariance (P, P) of the parameters of a design.
 
-    As `joint_covariance.forward_covariance`, with z = (b, 1 at the sample's own survey). Without known directions the
-    frame is that of `nearest_frame`; with them it is the one that they are in, Q the identity.
+    The scores of a survey have its information for their covariance, along the field times chi2_along where that is
+    more than one. What is left free by the convention of the frame has no variance.
 
     Parameters
     ----------
-    forward: (S, 3, 3) C Q; q: (3, 3) Q.
+    scatter: variance of the elements of C about what the design gives each survey.
+
+    Raises
+    ------
+    NotEnoughData: a parameter is left open.
     """
-    found, plane, data = fit.found, fit.plane, fit.data
-    sensors, size, centres = len(forward), 3 * len(forward), data.centres
-    width = 3 + centres
-    moments = np.zeros((width, width))
-    for k, own in enumerate(found.sums.moments):
-        moments[:3, :3] += q.T @ own[:3, :3] @ q
-        moments[:3, 3 + k] = moments[3 + k, :3] = own[3, :3] @ q
-        moments[3 + k, 3 + k] = own[3, 3]
-    free = data.free
-    to_field = np.zeros((free + 3 * centres, 3, width))
-    if free == SYMMETRIC:
-        for k, (i, j) in enumerate(_PLACES):
-            to_field[k, :, :3] = (np.outer(found.matrix[i], q[j]) + np.outer(found.matrix[j], q[i])) / 2
-    else:
-        for k in range(free):
-            to_field[k, :, :3] = np.outer(found.matrix[k // 3], q[k % 3])
-    for k in range(centres):
-        to_field[free + 3 * k : free + 3 * k + 3, :, 3 + k] = found.matrix
-    rows = to_field.reshape(free + 3 * centres, 3 * width)
-    normal = found.sums.along_normal / max(fit.chi2_along, 1.0) + found.sums.across_normal
-    inner = rows.T @ normal @ rows
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(inner), 1e-300))
-    values, vectors = np.linalg.eigh(inner * np.outer(scale, scale))
-    gauge = 3 if free == SYMMETRIC else 0
-    root = (vectors[:, gauge:] / np.sqrt(values[gauge:])) * scale[:, None]
-    v = plane.basis
-    spread_in = np.kron(v, np.eye(width))
-    whitened = np.kron(np.eye(size) - v @ v.T, np.linalg.inv(moments)) + (spread_in @ root) @ (spread_in @ root).T
-    sd = np.repeat(plane.noise, width)
-    covariance = whitened * np.outer(sd, sd)
-    pick = [width * i + j for i in range(size) for j in range(3)]
-    pick += [width * i + 3 + k for k in range(centres) for i in range(size)]
-    covariance = covariance[np.ix_(pick, pick)]
-    if not gauge:
-        return covariance
-    of_c = [12 * s + j for s in range(sensors) for j in range(9)]
-    fixing = np.eye(len(covariance))
-    fixing[: 9 * sensors, : 9 * sensors] = frame_projection(forward)[np.ix_(of_c, of_c)]
-    out: Array = fixing @ covariance @ fixing.T
-    return out
+    jacobians = [design.whitened(k) for k in range(len(surveys))]
+    held, weight = np.zeros(design.size), sum(one.sums.weight for one in surveys)
+    for jacobian, one in zip(jacobians, surveys, strict=True):
+        held += jacobian.T @ one.to_field.T @ one.sums.held * np.sqrt(one.sums.weight)
+    mean = np.outer(held, held) / weight if weight else np.zeros((design.size, design.size))
+    bread = inverse_in(design.free(), summed_up(jacobians, [one.information for one in surveys]) + mean)
+    between = np.zeros_like(bread)
+    if scatter:
+        own = [one.information @ of_scatter(design, scatter) @ one.information for one in surveys]
+        between = summed_up(jacobians, own)
+    filling = summed_up(jacobians, [white(one, chi2_along) for one in surveys]) + mean
+    out: Array = bread @ (filling + between) @ bread
+    return (out + out.T) / 2
 
 
-def to_corrections(matrix: Array, centres: int) -> Array:
-    """Derivative of the corrections' elements, and of the same offsets, with C and offsets in the order above."""
+def white(one: Said, chi2_along: float) -> Array:
+    """(12 S, 12 S): covariance of a survey's scores in white noise."""
+    return one.outside + max(chi2_along, 1.0) * one.along + one.sighted
+
+
+def of_scatter(design: Design, scatter: float) -> Array:
+    """(12 S, 12 S): covariance of [C | o] / noise of a survey whose elements of C scatter by so large a variance."""
+    own = np.repeat(design.noise**-2.0, 4) * scatter
+    own[3::4] = 0.0
+    return np.diag(own)
+
+
+def to_corrections(matrix: Array) -> Array:
+    """(9 S, 9 S): derivative of the corrections' elements with those of C, sensor after sensor, row by row."""
     sensors = len(matrix)
-    out = np.eye(9 * sensors + 3 * sensors * centres)
+    out = np.zeros((9 * sensors, 9 * sensors))
     for s, m in enumerate(matrix):
         block = slice(9 * s, 9 * s + 9)
         out[block, block] = -np.kron(m, m.T)

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from magtensor.calibration.types import Array
+from magtensor.calibration.types import Array, Mask
 from magtensor.frame.sources import edges_of, excess
 
 
@@ -33,6 +33,12 @@ class Sighting:
     root: Array
     coupling: Array
     variance: Array
+
+    def at(self, some: Mask) -> Sighting:
+        """Those of some samples."""
+        return Sighting(
+            self.direction[some], self.length[some], self.root[some], self.coupling[some], self.variance[some]
+        )
 
 
 @dataclass(frozen=True)

@@ -14,13 +14,15 @@ import numpy as np
 
 from magtensor.calibration.common_field import CommonField, common_field, output_noise
 from magtensor.calibration.coverage import WORST_ERROR, Coverage, coverage, require_coverage
-from magtensor.calibration.joint import refuse_sensors
+from magtensor.calibration.joint import nearest_frame, refuse_sensors
 from magtensor.calibration.joint_together import FALSE_REJECTION, LEAST_FOR_REJECTION, told_apart
 from magtensor.calibration.maximum_likelihood import along
 from magtensor.calibration.types import Array, Mask
 from magtensor.errors import DataError, NotEnoughData
 
+from .design import Design
 from .directions import across, attitude_std, disagreement, sighting
+from .said import Said, each_of, said, view
 from .samples import Samples
 from .start import on_ellipsoid, on_known_field
 from .sums import Found, InPlane, minimised, with_scale
@@ -44,6 +46,7 @@ class SurveysFit:
         coverage: of all surveys together.
         attitude_std: rad; None without known directions.
         attitude_excess: by how much the variance of what the attitudes tell was widened (`directions.disagreement`).
+        said: what every survey says at these parameters, in the calibration's frame (`frame_of`).
     """
 
     forward: Array
@@ -55,6 +58,14 @@ class SurveysFit:
     coverage: Coverage
     attitude_std: float | None = None
     attitude_excess: float = 1.0
+    said: tuple[Said, ...] = ()
+
+    @property
+    def design(self) -> Design:
+        """Of C and the offsets."""
+        surveys = len(self.said)
+        weights = np.eye(surveys) if len(self.offset) > 1 else np.ones((surveys, 1))
+        return Design(np.ones((surveys, 1)), weights, self.plane.noise, self.attitude_std is not None)
 
     @property
     def chi2_along(self) -> float:
@@ -93,7 +104,7 @@ def fit_surveys(
     NotEnoughData: the attitudes do not determine the parameters; the message says which are missing.
     DataError: values that no fit can use, a mirrored sensor, or one that does not see the field of the others.
     """
-    _require_usable(samples)
+    require_usable(samples)
     _require_turned_within_levels(samples)
     sensors, count = samples.raw.shape[1], len(samples.raw)
     judge = robust and count >= LEAST_FOR_REJECTION
@@ -103,7 +114,7 @@ def fit_surveys(
     told = 2 if sensors == 2 and own_noise else 0
     one = sensors == 1 and noise is None
     for _ in range(_ROUNDS):
-        fit = _fitted(samples, keep, given, common_offsets, reference_noise, attitude, worst_error)
+        fit = fitted(samples, keep, given, common_offsets, reference_noise, attitude, worst_error)
         if told > 0 and given is not None:
             given, told = _told_apart(given, fit, samples), told - 1
             continue
@@ -120,6 +131,12 @@ def fit_surveys(
                 "more than half of the samples disagree with any one calibration",
                 hint="look for a moving magnetic object, a dead axis or wrong units",
             )
+        left = np.bincount(samples.survey[again], minlength=samples.surveys)
+        if left.min() < LEAST_PER_SURVEY:
+            raise NotEnoughData(
+                f"nearly all samples of survey {int(left.argmin()) + 1} of {len(left)} disagree with the others",
+                hint="leave it out, or calibrate it alone and compare; C may also change slowly: `matrices: linear`",
+            )
         keep, one = again, sensors == 1 and noise is None
         if own_noise:
             given = output_noise(samples.raw, keep, samples.run)
@@ -127,11 +144,22 @@ def fit_surveys(
     require_coverage(fit.coverage)
     if mean_field is not None and samples.level is not None:
         fit = _scaled(fit, mean_field / float(np.mean(fit.found.sums.total_field)))
-    _refuse(fit, samples.at(fit.keep))
-    return fit
+    used = samples.at(fit.keep)
+    _refuse(fit, used)
+    forward = fit.forward @ frame_of(fit.forward, fit.attitude_std is not None)
+    offset = fit.offset if len(fit.offset) > 1 else np.repeat(fit.offset, samples.surveys, axis=0)
+    seen = (view(one, forward, o, fit.plane.noise) for one, o in zip(each_of(used, fit.data), offset, strict=True))
+    return replace(fit, said=tuple(said(one) for one in seen))
 
 
-def _require_usable(samples: Samples) -> None:
+def frame_of(forward: Array, sighted: bool) -> Array:
+    """The rotation Q (3, 3) that brings C to the frame of the calibration: the nearest to the raw axes, or its own
+    where directions are known."""
+    return np.eye(3) if sighted else nearest_frame(forward)
+
+
+def require_usable(samples: Samples) -> None:
+    """Refuse samples that are not finite, and surveys too small for an offset."""
     finite = np.isfinite(samples.raw).all() and np.isfinite(samples.total_field).all()
     if not finite or (samples.direction is not None and not np.isfinite(samples.direction).all()):
         raise DataError("the samples are not all finite", hint="mask the gaps before calibrating")
@@ -163,7 +191,7 @@ def _require_turned_within_levels(samples: Samples) -> None:
         )
 
 
-def _fitted(
+def fitted(
     samples: Samples,
     keep: Mask,
     noise: Array | None,
@@ -172,6 +200,7 @@ def _fitted(
     attitude: float | None,
     worst_error: float,
 ) -> SurveysFit:
+    """The fit of samples to keep (N,) with the noise (S, 3) nT of the outputs; the rest as in `fit_surveys`."""
     used = samples.at(keep)
     centre = np.zeros(len(used.raw), dtype=int) if common_offsets else used.survey
     counts = np.bincount(centre)

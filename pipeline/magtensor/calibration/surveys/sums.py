@@ -82,6 +82,8 @@ class Sums:
         along_normal, across_normal: (P, P) expected information of either.
         moments: (K, 4, 4) sum of z z', z = (field, 1), nT, for each centre.
         total_field: (N,) nT, the unknown constants at their best.
+        held: (P,); along_normal has held held' more than the samples tell, which holds the mean of unknown constants.
+        weight: 1/nT^2, of that mean.
     """
 
     along: float
@@ -91,6 +93,8 @@ class Sums:
     across_normal: Array
     moments: Array
     total_field: Array = field(repr=False)
+    held: Array
+    weight: float
 
     @property
     def normal(self) -> Array:
@@ -162,9 +166,10 @@ def summed(data: InPlane, matrix: Array, centres: Array) -> Sums:
             across_normal[np.ix_(at, at)] += rows.T @ rows
     if levels:
         along_normal -= (by_level / np.maximum(weight, 1e-300)) @ by_level.T
-        whole = by_level.sum(axis=1)
-        along_normal += np.outer(whole, whole) / weight.sum()
-    return Sums(costs[0], costs[1], gradient, along_normal, across_normal, moments, total_field)
+    held = by_level.sum(axis=1) / np.sqrt(weight.sum()) if levels else np.zeros(size)
+    along_normal += np.outer(held, held)
+    total = float(weight.sum())
+    return Sums(costs[0], costs[1], gradient, along_normal, across_normal, moments, total_field, held, total)
 
 
 @dataclass(frozen=True)
