@@ -159,12 +159,37 @@ def validate(recipe: Path, survey: Path | None, overrides: tuple[str, ...], plug
 @cli.command()
 @click.argument("file", type=FILE)
 @click.option("--reader", help="The reader plugin; default: by the file name's ending.")
+@click.option(
+    "--attitudes", "picture", type=FILE, metavar="PICTURE",
+    help="Draw (.svg, .png, .pdf) which attitudes the sensors saw and which further ones a calibration needs most. "
+    "FILE is then a survey in the canonical layout, or a recipe that reads and prepares one.",
+)  # fmt: skip
+@click.option("--input", "survey", type=FILE, help="With --attitudes: the survey, in place of the recipe's own.")
+@click.option("--set", "overrides", multiple=True, metavar="PATH=VALUE", help="With --attitudes: as of `run`.")
 @plugins_option
-def inspect(file: Path, reader: str | None, plugin_folders: tuple[Path, ...]) -> None:
-    """Show what FILE holds, and propose a mapping for a recipe."""
-    from magtensor.survey.inspect import show
+def inspect(
+    file: Path,
+    reader: str | None,
+    picture: Path | None,
+    survey: Path | None,
+    overrides: tuple[str, ...],
+    plugin_folders: tuple[Path, ...],
+) -> None:
+    """Show what FILE holds, and propose a mapping for a recipe; or draw the attitudes of a survey."""
+    if picture is None:
+        from magtensor.survey.inspect import show
 
-    show(file, reader, plugin_folders)
+        if survey is not None or overrides:
+            raise click.UsageError("--input and --set go with --attitudes")
+        show(file, reader, plugin_folders)
+        return
+    from magtensor.seen_attitudes import draw_attitudes
+
+    if reader is not None:
+        raise click.UsageError("--attitudes takes no --reader: a recipe says how its survey is read")
+    for line in draw_attitudes(file, picture, survey=survey, overrides=overrides, plugin_folders=plugin_folders):
+        click.echo(line)
+    click.echo(f"attitudes: {picture}")
 
 
 @cli.command()

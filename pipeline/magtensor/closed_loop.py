@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import json
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,6 +17,7 @@ from magtensor.preparing import empty_survey
 from magtensor.provenance import Provenance, plan_again
 from magtensor.recipe.plan import Plan, plan
 from magtensor.recipe.source import Document, load_yaml
+from magtensor.refusal import picture_named
 from magtensor.session import Computed, Finished, compute, require_verifying
 from magtensor.survey.in_memory import Held, SurveyLike, given_survey
 from magtensor.survey.model import Survey
@@ -59,7 +61,8 @@ def close_loop(
         require_verifying(planned, verified, planned.source().files() if isinstance(given, Path) else ())
     source = planned.source() if isinstance(given, Path) else given
     held = verified if isinstance(verified, Held) else None
-    return ClosedLoop(compute(planned, empty_survey(source), verify=held, progress=progress))
+    with picture_named(given) if isinstance(given, Path) else nullcontext():
+        return ClosedLoop(compute(planned, empty_survey(source), verify=held, progress=progress))
 
 
 def planned_loop(

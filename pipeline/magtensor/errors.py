@@ -48,6 +48,10 @@ class NotEnoughData(DataError):
     """The data cannot determine what was asked: too few attitudes, a planar rotation, a geometry without depth."""
 
 
+class MissingAttitudes(NotEnoughData):
+    """The field was not turned enough: `magtensor inspect --attitudes` draws what is missing."""
+
+
 class BatchFailed(MagtensorError):
     """Some surveys of a batch failed; the others are done."""
 

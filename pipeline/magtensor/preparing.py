@@ -24,8 +24,9 @@ def empty_survey(source: Plan | Source | Held) -> Survey:
     return Survey(xr.DataTree(), source=source)
 
 
-def load_as(planned: Plan, path: Path | Held, *, tolerant: bool = False, rows: slice | None = None) -> Survey:
-    """Run only the stages of a recipe that read and prepare a survey (before any calibration) on another one.
+def load_as(planned: Plan, path: Path | Held | None, *, tolerant: bool = False, rows: slice | None = None) -> Survey:
+    """Run only the stages of a recipe that read and prepare a survey (before any calibration) on another one, or on
+    its own when None.
 
     A stage whose variables this survey lacks is left out; `tolerant` also leaves out one that the data refuse, as
     long as the survey itself was read (a field needs no base station to be corrected). `rows` reads only some samples.
@@ -34,7 +35,8 @@ def load_as(planned: Plan, path: Path | Held, *, tolerant: bool = False, rows: s
     if isinstance(path, Held):
         preparing, survey = replace(planned, stages=stages), empty_survey(path)
     else:
-        preparing = replace(planned, stages=stages, survey=planned.survey_for(path))
+        section = planned.survey if path is None else planned.survey_for(path)
+        preparing = replace(planned, stages=stages, survey=section)
         survey = empty_survey(replace(preparing.source(), rows=rows))
     for stage in stages:
         if all(any(_fits(p, need) for p in survey.paths()) for need in stage.declares.needs):

@@ -16,6 +16,7 @@ from magtensor.closed_loop import STAGE, loop_document, summary
 from magtensor.errors import MagtensorError, UsageError, did_you_mean
 from magtensor.explorer import Explorer
 from magtensor.recipe.source import load_yaml
+from magtensor.refusal import picture_named
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -72,7 +73,8 @@ def converse(
     directory = output or Path(f"{file.stem}.explored")
     require_writable(directory)
     console = Console(highlight=False, soft_wrap=True, width=None if sys.stdout.isatty() else 160)
-    explorer = Explorer(document, given, verify=verify, plugins=plugins)
+    with picture_named(file, survey=survey, plugin_folders=plugins):
+        explorer = Explorer(document, given, verify=verify, plugins=plugins)
     refuse_overwriting([directory / "result.nc"], explorer.inputs)
     session = Session(explorer, console, directory, _journal(file, directory, survey, verify))
     console.print(f"{file}: `help` lists the commands")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from magtensor.preparing import empty_survey, load_as
 from magtensor.provenance import Provenance
 from magtensor.qc import told
 from magtensor.recipe.plan import Plan, read_plan
+from magtensor.refusal import picture_named
 from magtensor.runner import RunResult, StageRecord, run
 from magtensor.survey.in_memory import Held
 from magtensor.survey.model import Survey
@@ -84,7 +86,9 @@ def run_recipe(
         memory_GiB = memory_GiB or float(before.notes.get("memory_GiB", 0)) or None
     else:
         planned = read_plan(recipe, overrides=overrides, plugin_folders=plugin_folders, survey=survey, verify=verify)
-    finished = run_plan(planned, output, progress=progress, memory_GiB=memory_GiB)
+    drawing = picture_named(recipe, survey=survey, overrides=overrides, plugin_folders=plugin_folders)
+    with drawing if before is None else nullcontext():
+        finished = run_plan(planned, output, progress=progress, memory_GiB=memory_GiB)
     if before is not None and not overrides and survey is None:
         return replace(finished, notes=(*compare(before, finished.made_by), *finished.notes))
     return finished

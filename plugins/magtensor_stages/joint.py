@@ -248,7 +248,7 @@ def _from_recording(
         fit = fit_recording(recording, reference_noise=reference_noise, robust=robust, worst_error=worst_error)
     except NotEnoughData as error:
         hint = "; ".join(p for p in (error.hint, ALL_THE_SAME) if p)
-        raise NotEnoughData(error.what, where=error.where, hint=hint) from error
+        raise type(error)(error.what, where=error.where, hint=hint) from error
     return calibrated(fit), usable & ~fit.keep
 
 

@@ -23,11 +23,13 @@ class Stop(BaseException):
 def outcome_of(task: Task) -> Outcome:
     """Run the task here; a bug's traceback goes to standard error."""
     from magtensor.recipe.plan import plan
+    from magtensor.refusal import picture_named
     from magtensor.session import run_plan
 
     try:
         planned = plan(task.document, plugin_folders=task.plugin_folders, survey=task.survey)
-        finished = run_plan(planned, task.folder)
+        with picture_named(task.document.file, survey=task.survey, plugin_folders=task.plugin_folders):
+            finished = run_plan(planned, task.folder)
     except MagtensorError as error:
         return Outcome(error.exit_status, str(error), 0.0)
     except Stop:

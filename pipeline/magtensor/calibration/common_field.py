@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from magtensor.errors import NotEnoughData
+from magtensor.errors import MissingAttitudes
 
 from .types import Array, Mask
 
@@ -64,12 +64,12 @@ def common_field(raw: Array, noise: Array | None = None, keep: Mask | None = Non
 
     Raises
     ------
-    NotEnoughData: fewer than five samples, or the field never left a plane through the outputs.
+    MissingAttitudes: fewer than five samples, or the field never left a plane through the outputs.
     """
     used = raw if keep is None else raw[keep]
     count, size = len(used), 3 * raw.shape[1]
     if count < 5:
-        raise NotEnoughData(
+        raise MissingAttitudes(
             f"{count} samples cannot tell the field from the sensors", hint="five attitudes are the least"
         )
     mean, moments = _moments(used)
@@ -102,7 +102,7 @@ def output_noise(raw: Array, keep: Mask | None = None, run: NDArray[np.int_] | N
 
     Raises
     ------
-    NotEnoughData: as in `common_field`.
+    MissingAttitudes: as in `common_field`.
     """
     among = None if keep is None else keep[:-2] & keep[1:-1] & keep[2:]
     if run is not None:
@@ -138,7 +138,7 @@ def _plane(moments: Array) -> tuple[Array, Array]:
     values, vectors = np.linalg.eigh(moments)
     basis = vectors[:, -3:][:, ::-1]
     if values[-3] <= 1e-12 * values[-1]:
-        raise NotEnoughData(
+        raise MissingAttitudes(
             "the outputs never leave a plane: the field was never turned about a second axis",
             hint="turn the array about more than one axis",
         )

@@ -30,14 +30,15 @@ deg at 1 nT mostly stay below it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from magtensor.errors import NotEnoughData
+from magtensor.errors import MissingAttitudes, NotEnoughData
 
 from .covariance import scalar_noise
-from .postures import Further, attitude_design, further_postures, sphere
+from .postures import Further, attitude_design, further_postures, further_together, sphere
 from .quadric import NotAnEllipsoid, ellipsoid_of, nearest_quadrics
 from .types import Array
 
@@ -49,6 +50,7 @@ WORST_ERROR = 0.05  # of F
 UNSEEN = 45.0  # deg: a half axis with no sample nearer counts as never seen
 SCATTERED = 0.5  # of the accepted error: samples so far from the surface are disturbed, whatever their attitudes
 SAME_ATTITUDE = 1e-3  # of F
+SAME_POSTURE = 0.1  # of the unit sphere's radius
 FAR_FROM_NOMINAL = 3.0  # scale factors this far from nominal come from a fit that found a surface, not a sensor
 
 
@@ -172,10 +174,8 @@ def coverage(
     first, second = (float(d) for d in nearest.distance[:2])
     found = first * np.sqrt(len(raw) / max(len(raw) - 9, 1))
     level = max(found if noise is None else min(found, noise / field), RESOLUTION)
-    reach = float(np.median(np.linalg.norm(raw - centre, axis=1))) / field
-    believable = 1 / FAR_FROM_NOMINAL < reach < FAR_FROM_NOMINAL
-    # from the centre of a surface that lies within a cluster of samples, they seem to lie all round
-    directions = _directions(points, centre / field) if believable else _directions(raw, np.zeros(3))
+    believable = _believable(raw, total_field, centre)
+    directions = seen_directions(raw, total_field, centre)
     worst = float("nan")
     attitude = attitude_design(directions)
     condition = _condition(attitude)
@@ -200,8 +200,39 @@ def coverage(
         empty_cones=_empty_cones(thinned),
         unseen=_unseen(thinned),
         still=tuple(a for a, spread in zip("xyz", np.ptp(points, axis=0), strict=True) if spread < SAME_ATTITUDE),
-        further=further_postures(attitude.T @ attitude, len(raw), max(len(raw) / distinct, 1.0)),
+        further=further_postures(attitude.T @ attitude, len(raw), _held(directions)),
     )
+
+
+def seen_directions(raw: Array, total_field: Array, offset: Array) -> Array:
+    """Directions (N, 3) of the field in the sensor's axes, from raw (N, 3), total_field (N,) and offset (3,) nT.
+
+    From the centre of a surface that lies within a cluster of samples, they would seem to lie all round: an offset
+    that leaves lengths far from the total field is not taken off.
+    """
+    out = raw - offset if _believable(raw, total_field, offset) else raw
+    length = np.linalg.norm(out, axis=1, keepdims=True)
+    return np.divide(out, length, out=np.zeros_like(out), where=length > 0)
+
+
+def _believable(raw: Array, total_field: Array, offset: Array) -> bool:
+    reach = float(np.median(np.linalg.norm(raw - offset, axis=1)) / np.mean(total_field))
+    return 1 / FAR_FROM_NOMINAL < reach < FAR_FROM_NOMINAL
+
+
+def same_postures(found: Sequence[Coverage], unit: Sequence[Array], turn: Array) -> list[Coverage]:
+    """The coverage of the sensors of one array with further postures that are the same for all.
+
+    Parameters
+    ----------
+    found: of each sensor alone; unit: its directions (N, 3).
+    turn: (S, 3, 3) from common axes to those of each sensor.
+    """
+    designs = [attitude_design(u) for u in unit]
+    together = further_together(
+        np.array([a.T @ a for a in designs]), turn, [len(a) for a in designs], [_held(u) for u in unit]
+    )
+    return [replace(own, further=further) for own, further in zip(found, together, strict=True)]
 
 
 def require_coverage(found: Coverage) -> None:
@@ -209,7 +240,8 @@ def require_coverage(found: Coverage) -> None:
 
     Raises
     ------
-    NotEnoughData: with the condition number and the directions that were never seen.
+    MissingAttitudes: with the condition number and the directions that were never seen.
+    NotEnoughData: the samples are disturbed, so that nothing can be said of their attitudes.
     """
     if found.determined:
         return
@@ -220,7 +252,7 @@ def require_coverage(found: Coverage) -> None:
         )
     missing = f": {found.missing}" if found.missing else ""
     help_most = f"; what would help most is {found.further}" if str(found.further) else ""
-    raise NotEnoughData(
+    raise MissingAttitudes(
         f"the attitudes do not determine scale factors, angles and offsets: {'; '.join(found.faults)}; "
         f"condition number {found.condition_number:.2g}{missing}",
         hint="turn the sensor so that the field passes through these directions too, about more than one axis"
@@ -269,18 +301,24 @@ def _bias(matrix: Array, offset: Array, nearest: Array) -> float:
     return float(np.max(np.abs(np.sqrt(squared) - 1.0)))
 
 
+def _held(directions: Array) -> float:
+    """How many samples a typical one has about it, itself included, within some 6 deg: a further posture is taken to
+    be held as long."""
+    counts = np.unique(_cells(directions, SAME_POSTURE), return_counts=True)[1].astype(float)
+    return float(np.sum(counts**2) / np.sum(counts))
+
+
 def _distinct(points: Array, cell: float) -> np.ndarray:
     """Indices of one point in each occupied cell of a grid, for points (N, 3) of order one."""
+    return np.unique(_cells(points, cell), return_index=True)[1]
+
+
+def _cells(points: Array, cell: float) -> np.ndarray:
+    """(N,) the numbers of the cells of a grid that points (N, 3) of order one lie in."""
     index = np.round((points - points.min(axis=0)) / cell).astype(np.int64)
     size = index.max(axis=0) + 1
-    return np.unique((index[:, 0] * size[1] + index[:, 1]) * size[2] + index[:, 2], return_index=True)[1]
-
-
-def _directions(points: Array, centre: Array) -> Array:
-    """Directions (N, 3) of the field in the sensor's axes, from points in units of F."""
-    shifted = points - centre
-    length = np.linalg.norm(shifted, axis=1, keepdims=True)
-    return np.divide(shifted, length, out=np.zeros_like(shifted), where=length > 0)
+    numbers: np.ndarray = (index[:, 0] * size[1] + index[:, 1]) * size[2] + index[:, 2]
+    return numbers
 
 
 def _gap_angles(directions: Array, where: Array) -> Array:

@@ -9,35 +9,47 @@ sphere are such a design; with n of them the variance of the length is 9 / n of 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from .types import Array
 
-ENOUGH = 2.0  # of the standard deviation that evenly spread samples would give: no further posture is named
-MOST = 4
+ENOUGH = 2.0  # of the standard deviation that evenly spread samples would give: no further posture is chosen
+MOST = 12  # nine determine the parameters, whatever is known before
+NAMED = 4  # in a sentence
+UNKNOWN = 1e4  # times what even samples give: noise alone says no less
 
 
 @dataclass(frozen=True)
 class Further:
-    """Postures that would help most, in order.
+    """Postures that would help most, in order, the first alone most of all.
 
     Attributes:
         directions: (K, 3) of the field, in the axes of the samples; none where the attitudes are spread well.
-        before, after: standard deviation of the length in the worst direction of the sphere, without them and with
-            them, as a multiple of what as many samples spread evenly would give; infinite where nothing is known.
+        worst: (K + 1,) standard deviation of the length in the worst direction of the sphere, without them and after
+            each, as a multiple of what as many samples spread evenly would give; above `UNKNOWN` nothing is known.
+        samples: how many there were; each: how many every posture adds.
     """
 
     directions: Array
-    before: float
-    after: float
+    worst: Array
+    samples: float
+    each: float
+
+    @property
+    def error(self) -> Array:
+        """(K + 1,) the same as a multiple of the noise of one sample; infinite where nothing is known."""
+        count = self.samples + self.each * np.arange(len(self.worst))
+        return np.where(self.worst < UNKNOWN, self.worst * 3.0 / np.sqrt(count), np.inf)
 
     def __str__(self) -> str:
-        named = ", ".join(f"({x:+.2f}, {y:+.2f}, {z:+.2f})" for x, y, z in self.directions)
+        named = ", ".join(f"({x:+.2f}, {y:+.2f}, {z:+.2f})" for x, y, z in self.directions[:NAMED])
         if not named:
             return ""
-        gain = f", {self.before / self.after:.2g} times better in the worst direction" if self.before < 1e6 else ""
+        before, after = self.worst[0], self.worst[min(NAMED, len(self.directions))]
+        gain = f", {before / after:.2g} times better in the worst direction" if before < UNKNOWN else ""
         return f"the field along {named}{gain}"
 
 
@@ -63,19 +75,43 @@ def further_postures(information: Array, samples: float, each: float = 1.0) -> F
     ----------
     samples: how many there are; each: how many a further posture would add.
     """
+    return further_together(information[None], np.eye(3)[None], [samples], [each])[0]
+
+
+def further_together(
+    information: Array, turn: Array, samples: Sequence[float], each: Sequence[float]
+) -> tuple[Further, ...]:
+    """Choose postures for several sensors of one array, at each step for the one that knows its worst direction least.
+
+    Parameters
+    ----------
+    information: (S, 9, 9), as for `further_postures`; samples, each: of every sensor.
+    turn: (S, 3, 3) from common axes to those of each sensor.
+
+    Returns
+    -------
+    The same postures for every sensor, each in its own axes.
+    """
     grid = sphere()
     design = attitude_design(grid)
     # what nothing is known of is known a millionth as well as the rest: the sums stay finite and its directions first
-    total = information + 1e-12 * np.trace(information) * np.eye(9)
-    count = samples
+    total = np.array([own + 1e-12 * np.trace(own) * np.eye(9) for own in information])
+    count, more = np.array(samples, dtype=float), np.array(each, dtype=float)
     chosen: list[Array] = []
-    before = worst = _worst(total, design, count)
-    while worst[1] > ENOUGH and len(chosen) < MOST:
-        a = design[worst[0]]
-        chosen.append(grid[worst[0]])
-        total, count = total + each * np.outer(a, a), count + each
-        worst = _worst(total, design, count)
-    return Further(np.array(chosen).reshape(-1, 3), before[1], worst[1])
+    found = [_worst(own, design, n) for own, n in zip(total, count, strict=True)]
+    worst = [[size for _, size in found]]
+    while max(worst[-1]) > ENOUGH and len(chosen) < MOST:
+        s = int(np.argmax(worst[-1]))
+        chosen.append(grid[found[s][0]] @ turn[s])
+        a = attitude_design(turn @ chosen[-1])
+        total, count = total + more[:, None, None] * (a[:, :, None] * a[:, None, :]), count + more
+        found = [_worst(own, design, n) for own, n in zip(total, count, strict=True)]
+        worst.append([size for _, size in found])
+    directions = np.array(chosen).reshape(-1, 3)
+    return tuple(
+        Further(directions @ to.T, np.array(sizes), float(n), float(m))
+        for to, sizes, n, m in zip(turn, zip(*worst, strict=True), samples, each, strict=True)
+    )
 
 
 def _worst(information: Array, design: Array, samples: float) -> tuple[int, float]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from magtensor.errors import DataError, NotEnoughData
+from magtensor.errors import DataError, MissingAttitudes, NotEnoughData
 
 from .covariance import residual, scalar_influence, scalar_noise
 from .coverage import LEAST_SAMPLES, WORST_ERROR, Coverage, coverage, require_coverage
@@ -18,14 +18,14 @@ def checked_samples(raw: Array, total_field: Array) -> tuple[Array, Array]:
 
     Raises
     ------
-    NotEnoughData: fewer than ten samples.
+    MissingAttitudes: fewer than ten samples.
     DataError: a value that is not finite, or a total field that is not positive.
     """
     raw, total_field = np.asarray(raw, dtype=float), np.asarray(total_field, dtype=float)
     if raw.ndim != 2 or raw.shape[1] != 3 or total_field.shape != raw.shape[:1]:
         raise ValueError(f"raw {raw.shape} and total_field {total_field.shape} are not (N, 3) and (N,)")
     if len(raw) < LEAST_SAMPLES:
-        raise NotEnoughData(
+        raise MissingAttitudes(
             f"{len(raw)} samples cannot determine nine parameters and their errors",
             hint=f"at least {LEAST_SAMPLES} samples in nine different attitudes are needed",
         )

@@ -7,15 +7,22 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from magtensor.calibration.types import Array
-from magtensor.report.drawing import GRID, INK, MUTED, WIDTH, colour, label, legend, legend_height, panels
+from magtensor.report.drawing import ALARM, GRID, INK, MUTED, WASH, WIDTH, colour, label, legend, legend_height, panels
 from magtensor.report.reduction import cell_means, disc, trend
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from matplotlib.image import AxesImage
 
+    from magtensor.calibration.coverage import Cone, Coverage
+
 RINGS = (30.0, 60.0)  # deg above the plane z = 0
+REACH = 1.12  # of a disc's radius
+TINTED = 181  # cells across a disc
+MARKED = 4  # postures in the report's picture: those that its words name
 AZIMUTHS = np.arange(-180.0, 180.1, 15.0)
 ELEVATIONS = np.arange(-90.0, 90.1, 10.0)
 
@@ -26,13 +33,14 @@ def directions(b: Array) -> Array:
     return np.divide(b, length, out=np.full_like(b, np.nan), where=length > 0)
 
 
-def coverage(unit: Array, residual: Array | None, sensors: list[str]) -> Figure:
+def coverage(unit: Array, residual: Array | None, sensors: list[str], found: Sequence[Coverage | None] = ()) -> Figure:
     """Where each sensor's field pointed: two hemispheres in equal area, coloured by the mean residual.
 
     Args:
         unit: (N, S, 3) directions, NaN where not in use.
         residual: (N, S) nT, or None: then the directions alone.
         sensors: S names.
+        found: of each sensor what its attitudes can determine: further postures and empty cones are marked.
     """
     across = 1 if len(sensors) == 1 else 2 if len(sensors) <= 4 else 3
     rows = -(-len(sensors) // across)
@@ -42,9 +50,10 @@ def coverage(unit: Array, residual: Array | None, sensors: list[str]) -> Figure:
     maps: list[AxesImage] = []
     for i, name in enumerate(sensors):
         for axes, up in ((grid[2 * i], True), (grid[2 * i + 1], False)):
-            _globe(axes)
             axes.set_title(f"{label(name, 16)}  {'z > 0' if up else 'z < 0'}", loc="center")
-            maps.append(_hemisphere(axes, unit[:, i], None if residual is None else residual[:, i], up))
+            maps.append(hemisphere(axes, unit[:, i], None if residual is None else residual[:, i], up))
+            if i < len(found) and (judged := found[i]) is not None:
+                mark(axes, judged, up, MARKED)
     for axes in grid[2 * len(sensors) :]:
         axes.set_axis_off()
     if residual is None:
@@ -62,10 +71,12 @@ def coverage(unit: Array, residual: Array | None, sensors: list[str]) -> Figure:
     return figure
 
 
-def _hemisphere(axes: Axes, unit: Array, residual: Array | None, up: bool) -> AxesImage:
+def hemisphere(axes: Axes, unit: Array, residual: Array | None, up: bool) -> AxesImage:
+    """Draw one half of the sphere with the directions (N, 3) seen in it, coloured by residual (N,) nT where given."""
     from matplotlib.colors import ListedColormap
     from matplotlib.patches import Circle
 
+    _globe(axes)
     here = np.isfinite(unit).all(axis=1) & ((unit[:, 2] >= 0) == up)
     values = np.ones(int(here.sum())) if residual is None else residual[here]
     look: dict[str, Any] = {"cmap": "RdYlBu_r"} if residual is not None else {"cmap": ListedColormap([colour(0)])}
@@ -73,10 +84,58 @@ def _hemisphere(axes: Axes, unit: Array, residual: Array | None, up: bool) -> Ax
         cell_means(disc(unit[here]), values),
         origin="lower", extent=(-1, 1, -1, 1), interpolation="none", zorder=2, **look,
     )  # fmt: skip
-    axes.set_xlim(-1.12, 1.12)  # the image had set its own
-    axes.set_ylim(-1.12, 1.12)
+    axes.set_xlim(-REACH, REACH)  # the image had set its own
+    axes.set_ylim(-REACH, REACH)
     image.set_clip_path(Circle((0, 0), 1.0, transform=axes.transData))
     return image
+
+
+def mark(axes: Axes, found: Coverage, up: bool, most: int) -> None:
+    """Number the further postures of one half of the sphere, and tint and outline the cones that hold no sample."""
+    from matplotlib.colors import ListedColormap
+    from matplotlib.patches import Circle
+
+    if found.empty_cones:
+        tint = np.where(_within(found.empty_cones, up), 0.0, np.nan)
+        shade = axes.imshow(
+            tint, origin="lower", extent=(-1, 1, -1, 1), cmap=ListedColormap([ALARM]), alpha=0.09, zorder=1
+        )
+        shade.set_clip_path(Circle((0, 0), 1.0, transform=axes.transData))
+        axes.set_xlim(-REACH, REACH)
+        axes.set_ylim(-REACH, REACH)
+    for cone in found.empty_cones:
+        axes.plot(*rim(cone, up).T, color=INK, linewidth=1.0, linestyle=(0, (4, 2)), zorder=4)
+    round_it: dict[str, Any] = {"boxstyle": "circle,pad=0.2", "facecolor": WASH, "edgecolor": ALARM, "linewidth": 1.1}
+    for k, direction in enumerate(found.further.directions[:most], 1):
+        if (direction[2] >= 0) == up:
+            x, y = disc(direction[None])[0]
+            axes.text(
+                x, y, str(k), ha="center", va="center", fontsize=7, color=ALARM, weight="bold", bbox=round_it, zorder=5
+            )  # fmt: skip
+
+
+def _within(cones: Sequence[Cone], up: bool) -> np.ndarray:
+    """(TINTED, TINTED), first index along y: whether a direction of one half of the sphere lies in one of the cones."""
+    x, y = np.meshgrid(*[np.linspace(-1, 1, TINTED)] * 2)
+    squared = np.minimum(x**2 + y**2, 1.0)
+    height = (1.0 - squared) if up else (squared - 1.0)
+    along = np.sqrt(2.0 - squared)  # of the disc's radius to that of the sphere: Lambert
+    inside = [
+        c.axis[0] * along * x + c.axis[1] * along * y + c.axis[2] * height >= np.cos(np.radians(c.half_angle_deg))
+        for c in cones
+    ]
+    return np.any(inside, axis=0)
+
+
+def rim(cone: Cone, up: bool) -> Array:
+    """(M, 2) in the disc of one half of the sphere: the directions at a cone's half angle; NaN in the other half."""
+    axis, half = np.array(cone.axis), np.radians(cone.half_angle_deg)
+    some = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
+    first = some / np.linalg.norm(some)
+    turn = np.linspace(0, 2 * np.pi, 361)[:, None]
+    across = np.cos(turn) * first + np.sin(turn) * np.cross(axis, first)
+    direction = np.cos(half) * axis + np.sin(half) * across
+    return np.where((direction[:, 2:] >= 0) == up, disc(direction), np.nan)
 
 
 def _globe(axes: Axes) -> None:

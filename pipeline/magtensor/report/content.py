@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -19,7 +19,11 @@ from magtensor.errors import DataError
 from magtensor.provenance import GROUP, Provenance
 from magtensor.survey.model import Survey
 
+if TYPE_CHECKING:
+    from magtensor.calibration.coverage import Coverage
+
 AGAIN = "run the recipe again to write it anew"
+JUDGED = 20_000  # samples of a sensor: enough to see every cone of a few degrees
 TIMED = ("calibrated", "residual", "detrended")
 
 
@@ -89,6 +93,31 @@ class Content:
         if "calibrated/good" in self.survey:
             return np.asarray(self.survey.values("calibrated/good")).astype(bool)
         return np.ones(len(self.time), dtype=bool)
+
+    @cached_property
+    def coverage(self) -> list[Coverage | None]:
+        """What the attitudes of each sensor can determine, judged from its calibrated field; None of fewer than ten
+        samples, empty where the result has no field."""
+        from magtensor.calibration.coverage import coverage, same_postures
+
+        b = self.in_use("calibrated/b")
+        if b is None or not b.size:
+            return []
+        found: dict[int, tuple[Coverage, Array]] = {}
+        for i in range(b.shape[1]):
+            known = b[np.isfinite(b[:, i]).all(axis=1), i]
+            known = known[:: max(1, len(known) // JUDGED)]
+            length = np.linalg.norm(known, axis=1)
+            known, length = known[length > 0], length[length > 0]
+            if len(known) >= 10:
+                judged = coverage(known, length, matrix=np.eye(3), offset=np.zeros(3))
+                found[i] = (judged, known / length[:, None])
+        if not found:
+            return [None] * b.shape[1]
+        alone, unit = zip(*found.values(), strict=True)
+        together = same_postures(alone, unit, np.tile(np.eye(3), (len(alone), 1, 1)))
+        given = dict(zip(found, together, strict=True))
+        return [given.get(i) for i in range(b.shape[1])]
 
     @cached_property
     def flags(self) -> list[dict[str, Any]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,12 +27,13 @@ class Arrays:
     """What the pictures are drawn from, cut down to the sensors that fit on them.
 
     Attributes:
-        sensors: names of the sensors shown; left_out: how many are not.
+        sensors, shown: names and numbers of the sensors shown; left_out: how many are not.
         residual, before: (N, S) nT; b, contrast: (N, S, 3) nT; None where the result has none.
         noise: (S,) nT of an axis of each sensor; contrast_noise: (S,) nT, what it makes of an axis of the contrast.
     """
 
     sensors: list[str]
+    shown: Sequence[int]
     left_out: int
     residual: Array | None
     before: Array | None
@@ -60,6 +62,7 @@ def arrays(content: Content) -> Arrays:
         keep = keep[:MOST_SENSORS]
     return Arrays(
         [content.sensors[k] for k in keep],
+        [int(k) for k in keep],
         count - len(keep),
         noise=content.noise[keep],
         contrast_noise=_contrast_noise(content.noise)[keep],
@@ -171,12 +174,17 @@ def _attitude_pictures(content: Content, use: Arrays) -> list[Picture | Gap]:
     residual, frame = use.residual, f" Frame: {content.frame}." if content.frame else ""
     caption = (
         "Where the field pointed in the array's frame: the two halves of the sphere, each seen from +z, in equal area; "
-        "rings at 30 and 60 deg. What a fit cannot know lies in the empty parts."
+        "rings at 30 and 60 deg. What a fit cannot know lies in the empty parts: dashed are the widest cones without a "
+        "sample."
     )
+    found_of = [content.coverage[k] for k in use.shown] if content.coverage else []
+    if any(c is not None and len(c.further.directions) for c in found_of):
+        caption += " Numbers: the field along these directions would help most, in this order; the table has the gain."
+
     coloured = " Colour: the mean of what is left there." if residual is not None else ""
     found: list[Picture | Gap] = [
         picture("Attitudes", caption + coloured + frame + _left_out(use), lambda: attitude_pictures.coverage(
-            unit, residual, use.sensors
+            unit, residual, use.sensors, found_of
         ))
     ]  # fmt: skip
     if residual is not None:

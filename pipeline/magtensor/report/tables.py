@@ -320,29 +320,23 @@ def flag_groups(content: Content) -> tuple[list[FlagGroup], int]:
 
 def attitudes(content: Content) -> Table | None:
     """What the attitudes of each sensor can determine, judged from its calibrated field."""
-    from magtensor.calibration.coverage import coverage
+    from magtensor.calibration.postures import NAMED
 
-    b = content.in_use("calibrated/b")
-    if b is None or not b.size:
+    if not content.coverage:
         return None
     rows: dict[str, list[str]] = {}
-    most = 20_000  # enough to see every cone of a few degrees
-    for i in range(b.shape[1]):
-        known = b[np.isfinite(b[:, i]).all(axis=1), i]
-        known = known[:: max(1, len(known) // most)]
-        length = np.linalg.norm(known, axis=1)
-        known, length = known[length > 0], length[length > 0]
-        if len(known) < 10:
-            cells = ["fewer than ten samples", *[UNKNOWN] * 4]
+    for found in content.coverage:
+        if found is None:
+            cells = ["fewer than ten samples", *[UNKNOWN] * 5]
         else:
-            found = coverage(known, length, matrix=np.eye(3), offset=np.zeros(3))
             unseen = ", ".join(found.unseen) or "none"
             cone = str(found.empty_cones[0]) if found.empty_cones else "none wider than 30 deg"
             further = str(found.further) or "none: well spread"
-            cells = [count(found.distinct), number(found.condition_number, 3), unseen, cone, further]
+            error = " → ".join(f"{e:.3g}" if np.isfinite(e) else "unknown" for e in found.further.error[: NAMED + 1])
+            cells = [count(found.distinct), number(found.condition_number, 3), unseen, cone, further, error]
         headings = (
             "distinct attitudes", "condition number", "half axes never seen", "largest cone without a sample",
-            "postures that would help most",
+            "postures that would help most", "worst error of |b|, now → after each, times a sample's noise",
         )  # fmt: skip
         for heading, cell in zip(headings, cells, strict=True):
             rows.setdefault(heading, []).append(cell)
