@@ -3,7 +3,8 @@
 Prints the tables of docs/benchmarks/joint.md; `--plot FILE.svg` draws the growth with the number of samples. Each
 figure is that of a process of its own on the same simulated sensors (50 000 nT, offsets of some 100 nT, 5 % of scale,
 1 to 2 deg, 3 nT of noise, METHODS part C); peer and product take turns, so that what else the machine does meets
-both. Peers need not be installed where the product is: `--peer-python PATH` names an interpreter that has them; one
+both. Peers need not be installed where the product is: `--peer-python PATH` names an interpreter that has them, and
+`--nliaudat PATH` the script calibrate.py of github.com/nliaudat/magnetometer_calibration, which no package has; one
 that cannot be imported is left out, with its reason.
 """
 
@@ -25,6 +26,8 @@ import numpy as np
 
 FIELD_NT, NOISE_NT = 50_000.0, 3.0
 PEER = "magyc 1.0.0 ellipsoid_fit_fang"
+SCRIPT = "nliaudat calibrate.py"
+PEERS = (PEER, SCRIPT)
 JOINT = "magtensor joint"
 FROM_DISK = "magtensor joint, from disk"
 TURNS, REPEATS = 3, 3
@@ -80,6 +83,31 @@ def fang(samples: int, sensors: int) -> tuple[Callable[[], Any], Callable[[Any],
     return fit, lambda found: max(error_nT(np.linalg.inv(m), o, s, sensors) for s, (o, m) in enumerate(found))
 
 
+def nliaudat(samples: int, sensors: int) -> tuple[Callable[[], Any], Callable[[Any], float]]:
+    """The peer fits each sensor alone; it is a script that prints."""
+    import contextlib
+    import importlib.util
+
+    if "NLIAUDAT" not in os.environ:
+        raise SystemExit("no script named with --nliaudat")
+    spec = importlib.util.spec_from_file_location("calibrate", os.environ["NLIAUDAT"])
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    raw = list(recorded(np.empty((sensors, samples, 3)).swapaxes(0, 1), samples, sensors).swapaxes(0, 1))
+
+    def fit() -> Any:
+        found = []
+        for each in raw:
+            one = module.MagnetometerCalibrator(FIELD_NT)
+            with contextlib.redirect_stdout(None):
+                one.calibrate(each)
+            found.append((one.b.ravel(), one.A_1))
+        return found
+
+    return fit, lambda found: max(error_nT(m, o, s, sensors) for s, (o, m) in enumerate(found))
+
+
 def joint(samples: int, sensors: int) -> tuple[Callable[[], Any], Callable[[Any], float]]:
     """All sensors together, robust, with the covariance of all parameters."""
     from magtensor.calibration.joint import calibrated, fit_joint
@@ -119,7 +147,7 @@ def _error(sensors: int) -> Callable[[Any], float]:
     return lambda found: max(error_nT(found.matrix[s], found.offset[s], s, sensors) for s in range(sensors))
 
 
-WAYS = {PEER: fang, JOINT: joint, FROM_DISK: from_disk}
+WAYS = {PEER: fang, SCRIPT: nliaudat, JOINT: joint, FROM_DISK: from_disk}
 
 
 def worker(name: str, samples: int, sensors: int) -> None:
@@ -136,7 +164,7 @@ def worker(name: str, samples: int, sensors: int) -> None:
 
 def measured(name: str, samples: int, sensors: int, python: str) -> dict[str, float] | str:
     """The worker's figures, or why there are none."""
-    interpreter = python if name == PEER else sys.executable
+    interpreter = python if name in PEERS else sys.executable
     command = [interpreter, __file__, "--worker", name, str(samples), str(sensors)]
     done = subprocess.run(command, env=os.environ | {"OPENBLAS_NUM_THREADS": "1"}, capture_output=True, text=True)
     if done.returncode:
@@ -148,19 +176,19 @@ def measured(name: str, samples: int, sensors: int, python: str) -> dict[str, fl
 def beside(samples: int, sensors: int, python: str) -> None:
     """Print rows of peer and product, taking turns."""
     best: dict[str, dict[str, float]] = {}
-    reason = ""
+    reason: dict[str, str] = {}
     for _ in range(TURNS):
-        for name in (PEER, JOINT):
+        for name in (*PEERS, JOINT):
             found = measured(name, samples, sensors, python)
             if isinstance(found, str):
-                reason = found
+                reason[name] = found
                 if name == JOINT:
                     raise SystemExit(f"{name}: {found}")
             elif name not in best or found["seconds"] < best[name]["seconds"]:
                 best[name] = found
-    for name in (PEER, JOINT):
+    for name in (*PEERS, JOINT):
         if name not in best:
-            print(f"| {sensors} | {name} | left out: {reason} | | | |", flush=True)
+            print(f"| {sensors} | {name} | left out: {reason[name]} | | | |", flush=True)
             continue
         row = best[name]
         ratio = f"{row['seconds'] / best[PEER]['seconds']:.2f}" if PEER in best else ""
@@ -193,6 +221,7 @@ def main() -> None:
     """Print both tables."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--peer-python", default=sys.executable, help="an interpreter that can import the peers")
+    parser.add_argument("--nliaudat", type=Path, help="the script calibrate.py of that peer")
     parser.add_argument("--quick", action="store_true", help="at most 100 000 samples")
     parser.add_argument("--plot", type=Path, help="draw the second table")
     parser.add_argument("--worker", nargs=3, metavar=("NAME", "SAMPLES", "SENSORS"), help=argparse.SUPPRESS)
@@ -200,9 +229,11 @@ def main() -> None:
     if chosen.worker:
         worker(chosen.worker[0], int(chosen.worker[1]), int(chosen.worker[2]))
         return
+    if chosen.nliaudat is not None:
+        os.environ["NLIAUDAT"] = str(chosen.nliaudat.resolve())
     most = 100_000 if chosen.quick else 1_000_000
     print(f"{most} samples; a peer's fit of several sensors is the sum of its single fits\n")
-    print("| sensors | fit | s | over the peer | peak MB | worst error nT |\n|---|---|---|---|---|---|")
+    print("| sensors | fit | s | over magyc | peak MB | worst error nT |\n|---|---|---|---|---|---|")
     for sensors in (1, 4):
         beside(most, sensors, chosen.peer_python)
     print("\n| sensors | samples | fit | s | us a sample | peak MB | worst error nT |\n|---|---|---|---|---|---|---|")

@@ -27,6 +27,11 @@ def test_the_joint_benchmark_measures_and_says_what_it_left_out() -> None:
         # 3 nT over the square root of so many samples, nine parameters
         assert 0 < figures["error_nT"] < 5 * 3.0 * 3.0 / 20_000**0.5
         assert figures["seconds"] > 0 and figures["peak_MB"] > 20
-    code = "import joint, sys; print(joint.measured(joint.PEER, 1000, 1, '/bin/false'))"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=script.parent)
-    assert done.stdout.strip() == "no reason given"
+    for name, python, reason in (
+        ("joint.PEER", "'/bin/false'", "no reason given"),
+        ("joint.SCRIPT", "sys.executable", "no script named with --nliaudat"),
+    ):
+        code = f"import joint, sys; print(joint.measured({name}, 1000, 1, {python}))"
+        command = [sys.executable, "-c", code]
+        done = subprocess.run(command, capture_output=True, text=True, check=True, cwd=script.parent)
+        assert done.stdout.strip() == reason
