@@ -108,12 +108,15 @@ def _root(information: Array) -> Array:
     return out
 
 
-def colour_of_scores(blocks: BlockScores, chi2_across: float, chi2_along: float) -> ScoreColour | None:
+def colour_of_scores(
+    blocks: BlockScores, chi2_across: float, chi2_along: float, false_alarm: float = FALSE_ALARM
+) -> ScoreColour | None:
     """The covariance of the scores; None where white noise explains their scatter, or there are too few blocks.
 
     Parameters
     ----------
     chi2_across, chi2_along: mean square of the samples' whitened residuals, which the blocks' are compared with.
+    false_alarm: chance that white noise is called coloured.
     """
     from scipy.fft import dct
 
@@ -129,7 +132,7 @@ def colour_of_scores(blocks: BlockScores, chi2_across: float, chi2_along: float)
     scores -= scores.mean(axis=0)
     waves = dct(scores, axis=0, norm="ortho")[1:] * np.sqrt(many)
     groups = _groups(blocks.across.shape[1])
-    chance = FALSE_ALARM / (len(groups) * len(SHARES))
+    chance = false_alarm / (len(groups) * len(SHARES))
     widened = dict.fromkeys(groups, 1.0)
     slow: dict[str, _Slow] = {}
     turned, levels = np.eye(waves.shape[1]), (1.0, max(chi2_along, 1.0))

@@ -15,7 +15,7 @@ import numpy as np
 
 from magtensor.calibration.types import Array
 
-from .covariance import of_scatter, white
+from .covariance import of_scatter, of_scores
 from .design import Design, inverse_in, summed_up
 from .said import Said
 
@@ -28,7 +28,7 @@ def about_line(design: Design, surveys: Sequence[Said], chi2_along: float) -> tu
     variance of the elements of C between surveys that explains the excess."""
     jacobians = [design.whitened(k) for k in range(len(surveys))]
     information = [one.information for one in surveys]
-    noise = [white(one, chi2_along) for one in surveys]
+    noise = [of_scores(one, chi2_along) for one in surveys]
     bread = inverse_in(design.free(), summed_up(jacobians, information))
     unit = of_scatter(design, 1.0)
     scattered = [own @ unit @ own for own in information]

@@ -21,10 +21,11 @@ from magtensor.calibration.types import Array
 from magtensor.errors import DataError, NotEnoughData
 
 from .about import about_line, own_deviation
+from .colour import with_colour
 from .covariance import covariance_of
 from .design import Design, inverse_in, summed_up
 from .fit import SurveysFit, fit_surveys, fitted, frame_of, require_usable
-from .said import OneSurvey, Said, each_of, said, view
+from .said import OneSurvey, Said, View, each_of, said, view
 from .samples import Samples
 from .sums import SYMMETRIC
 
@@ -104,7 +105,9 @@ def fit_changing(
             if judge or not robust:
                 break
             judge = True  # not before: until a survey's own change is known it may look like spikes
-    parameters, found = _maximised(samples, alike, design, parameters)
+    parameters, _ = _maximised(samples, alike, design, parameters)
+    seen = _seen(each_of(samples.at(alike.keep), alike.data), design, parameters)
+    found = tuple(with_colour(one, said(one), len(seen)) for one in seen)
     fit = ChangingFit(alike, design, since, parameters, found)
     require_coverage(replace(alike.coverage, worst_error=predicted_error(fit)))
     return fit
@@ -139,8 +142,7 @@ def _maximised(
     jacobians, free = [design.whitened(k) for k in range(len(surveys))], design.free()
 
     def at(where: Array) -> tuple[Said, ...]:
-        seen = (view(one, *design.forward(where, k), design.noise) for k, one in enumerate(surveys))
-        return tuple(said(one) for one in seen)
+        return tuple(said(one) for one in _seen(surveys, design, where))
 
     here, damping = at(parameters), 0.0
     for _ in range(_MOST_STEPS):
@@ -163,6 +165,10 @@ def _maximised(
         if damping > 1e6:
             break
     raise NotEnoughData("the fit does not converge", hint="look for disturbed samples, or add attitudes")
+
+
+def _seen(surveys: list[OneSurvey], design: Design, parameters: Array) -> list[View]:
+    return [view(one, *design.forward(parameters, k), design.noise) for k, one in enumerate(surveys)]
 
 
 def _alike(

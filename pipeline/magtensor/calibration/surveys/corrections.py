@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from magtensor.calibration.common_scale import nominal, nominal_scale
-from magtensor.calibration.joint import diagnostics
+from magtensor.calibration.joint import diagnostics, widening
 from magtensor.calibration.types import Array, ArrayCalibration
 
-from .covariance import covariance_of, to_corrections, with_offset
+from .covariance import as_white, covariance_of, to_corrections, with_offset
 from .fit import SurveysFit, frame_of
 
 
@@ -85,9 +85,15 @@ def calibrated_surveys(fit: SurveysFit) -> SurveysCalibration:
     matrix: Array = np.asarray(np.linalg.inv(forward), dtype=np.float64)
     chain = np.eye(fit.design.size)
     chain[: 9 * len(matrix), : 9 * len(matrix)] = to_corrections(matrix)
-    covariance = chain @ covariance_of(fit.design, fit.said, fit.chi2_along) @ chain.T
+    covariance, white = (
+        chain @ covariance_of(fit.design, surveys, fit.chi2_along) @ chain.T
+        for surveys in (fit.said, as_white(fit.said))
+    )
     told = diagnostics(fit.keep, fit.chi2_along, fit.plane, fit.coverage, matrix)
     frame, free, more = frame_words(fit)
     with_first = with_offset(len(matrix), np.eye(len(fit.offset))[0])
-    common = ArrayCalibration(matrix, fit.offset[0], with_first @ covariance @ with_first.T, frame, free, told | more)
+    own = with_first @ covariance @ with_first.T
+    if any(one.coloured is not None for one in fit.said):
+        more |= widening(own, with_first @ white @ with_first.T)
+    common = ArrayCalibration(matrix, fit.offset[0], own, frame, free, told | more)
     return SurveysCalibration(common, fit.offset, covariance)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -15,8 +16,9 @@ from .said import Said
 def covariance_of(design: Design, surveys: Sequence[Said], chi2_along: float, scatter: float = 0.0) -> Array:
     """Covariance (P, P) of the parameters of a design.
 
-    The scores of a survey have its information for their covariance, along the field times chi2_along where that is
-    more than one. What is left free by the convention of the frame has no variance.
+    In white noise the scores of a survey have its information for their covariance, along the field times chi2_along
+    where that is more than one; in other noise what its blocks show. What the convention of the frame fixes has no
+    variance.
 
     Parameters
     ----------
@@ -36,14 +38,21 @@ def covariance_of(design: Design, surveys: Sequence[Said], chi2_along: float, sc
     if scatter:
         own = [one.information @ of_scatter(design, scatter) @ one.information for one in surveys]
         between = summed_up(jacobians, own)
-    filling = summed_up(jacobians, [white(one, chi2_along) for one in surveys]) + mean
+    filling = summed_up(jacobians, [of_scores(one, chi2_along) for one in surveys]) + mean
     out: Array = bread @ (filling + between) @ bread
     return (out + out.T) / 2
 
 
-def white(one: Said, chi2_along: float) -> Array:
-    """(12 S, 12 S): covariance of a survey's scores in white noise."""
+def of_scores(one: Said, chi2_along: float) -> Array:
+    """(12 S, 12 S): covariance of a survey's scores."""
+    if one.coloured is not None:
+        return one.coloured + one.sighted
     return one.outside + max(chi2_along, 1.0) * one.along + one.sighted
+
+
+def as_white(surveys: Sequence[Said]) -> list[Said]:
+    """What surveys say, their noise taken as white."""
+    return [replace(one, coloured=None) for one in surveys]
 
 
 def of_scatter(design: Design, scatter: float) -> Array:

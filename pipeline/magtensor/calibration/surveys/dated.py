@@ -10,13 +10,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from magtensor.calibration.joint import diagnostics
+from magtensor.calibration.joint import diagnostics, widening
 from magtensor.calibration.joint_covariance import frame_projection
 from magtensor.calibration.types import Array, ArrayCalibration
 
 from .changing import ChangingFit
 from .corrections import frame_words, scatter_of
-from .covariance import to_corrections
+from .covariance import as_white, covariance_of, to_corrections
 from .straight import Straight
 
 UNSEEN_RATE = (
@@ -112,6 +112,9 @@ def dated(fit: ChangingFit, found: Straight, survey: int, mean_offset: bool = Fa
     own = here @ found.covariance @ here.T + between
     told = diagnostics(fit.alike.keep, fit.alike.chi2_along, fit.alike.plane, fit.alike.coverage, matrix)
     frame, free, more = frame_words(fit.alike)
+    if any(one.coloured is not None for one in fit.said):
+        white = here @ covariance_of(design, as_white(fit.said), fit.alike.chi2_along, found.scatter**2) @ here.T
+        more |= widening(to_correction @ own @ to_correction.T, to_correction @ (white + between) @ to_correction.T)
     free = (*free, UNSEEN_RATE) if free and terms == 2 else free
     calibration = ArrayCalibration(matrix, offset, to_correction @ own @ to_correction.T, frame, free, told | more)
     return Dated(calibration, Change(relative, rates[:, 9:], covariance))

@@ -20,6 +20,7 @@ from magtensor.calibration.maximum_likelihood import along
 from magtensor.calibration.types import Array, Mask
 from magtensor.errors import DataError, NotEnoughData
 
+from .colour import with_colour
 from .design import Design
 from .directions import across, attitude_std, disagreement, sighting
 from .said import Said, each_of, said, view
@@ -148,8 +149,8 @@ def fit_surveys(
     _refuse(fit, used)
     forward = fit.forward @ frame_of(fit.forward, fit.attitude_std is not None)
     offset = fit.offset if len(fit.offset) > 1 else np.repeat(fit.offset, samples.surveys, axis=0)
-    seen = (view(one, forward, o, fit.plane.noise) for one, o in zip(each_of(used, fit.data), offset, strict=True))
-    return replace(fit, said=tuple(said(one) for one in seen))
+    seen = [view(one, forward, o, fit.plane.noise) for one, o in zip(each_of(used, fit.data), offset, strict=True)]
+    return replace(fit, said=tuple(with_colour(one, said(one), samples.surveys) for one in seen))
 
 
 def frame_of(forward: Array, sighted: bool) -> Array:

@@ -30,6 +30,7 @@ class Said:
         sums: of the part within W, E and e in the frame of C.
         to_field: (P, 12 S) the parameters of `sums` from a change of [C | o], with the sign reversed.
         perpendicular: (3 S, 3 S) projection; score: (12 S,) minus half the derivative of the cost.
+        coloured: (12 S, 12 S) covariance of the score, without known directions, where noise is not white (`colour`).
     """
 
     samples: int
@@ -38,6 +39,7 @@ class Said:
     to_field: Array
     perpendicular: Array
     score: Array
+    coloured: Array | None = None
 
     @property
     def cost(self) -> float:
@@ -124,15 +126,21 @@ def view(survey: OneSurvey, forward: Array, offset: Array, noise: Array) -> View
 def said(seen: View) -> Said:
     """The score and the information of samples."""
     sums = summed(seen.data, seen.matrix, np.zeros((1, 3)))
-    to_field = _to_field(seen.matrix @ seen.basis.T, seen.data.free)
+    to_field = field_change(seen.matrix @ seen.basis.T, seen.data.free)
     one_more = np.column_stack([seen.field, np.ones(len(seen.residual))])
     score = (seen.residual.T @ one_more).ravel() + to_field.T @ sums.gradient
     perpendicular = np.eye(len(seen.basis)) - seen.basis @ seen.basis.T
     return Said(len(one_more), float(np.sum(seen.residual**2)), sums, to_field, perpendicular, score)
 
 
-def _to_field(inverse: Array, free: int) -> Array:
-    """(P, 12 S) from W^+ (3, 3 S): how W^+ [dW | dw] (b, 1) is made of the parameters of `sums`."""
+def field_change(inverse: Array, free: int) -> Array:
+    """(P, 12 S): the parameters of `sums`, six or nine of E and three of e, from a change [dW | dw] of the outputs,
+    which moves the field by -W^+ [dW | dw] (b, 1); with the sign reversed.
+
+    Parameters
+    ----------
+    inverse: (3, 3 S), W^+.
+    """
     outputs = inverse.shape[1]
     out = np.zeros((free + 3, outputs, 4))
     if free == SYMMETRIC:
