@@ -98,9 +98,9 @@ def at_date_of(
     first, last = (parse_instant(str(calibration[RATE].attrs[end])) for end in ("first", "last"))
     words = f"of {date:%Y-%m-%d}"
     if date > last:
-        words += f", extrapolated: {years_between(last, date):.2g} years after the last survey of the fit"
+        words += f", extrapolated: {years_between(last, date):.2f} years after the last survey of the fit"
     elif date < first:
-        words += f", extrapolated: {years_between(date, first):.2g} years before the first survey of the fit"
+        words += f", extrapolated: {years_between(date, first):.2f} years before the first survey of the fit"
     else:
         words += ", between the surveys of the fit"
     return found.calibration, words
@@ -114,6 +114,11 @@ def change_at_date_of(survey: Survey, calibration: Survey, fitted: ArrayCalibrat
     attributes = calibration[RATE].attrs
     facts = {name: str(attributes[name]) for name in ("first", "last", "words")}
     return change_variables(_dated(calibration, fitted, date).change, survey.sensors, date, facts)
+
+
+def told_of_change(survey: Survey) -> tuple[str, ...]:
+    """What a fit found of the change with the date, for the user; nothing where none was fitted."""
+    return (f"with the date: {survey[RATE].attrs['words']}",) if RATE in survey else ()
 
 
 def _dated(calibration: Survey, fitted: ArrayCalibration, date: datetime) -> Dated:

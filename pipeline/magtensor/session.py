@@ -12,6 +12,7 @@ from magtensor import provenance, result
 from magtensor.applying import verification
 from magtensor.atomic import refuse_overwriting, require_writable
 from magtensor.calibrated import left_open
+from magtensor.dated import told_of_change
 from magtensor.errors import UsageError
 from magtensor.preparing import empty_survey, load_as
 from magtensor.provenance import Provenance
@@ -156,7 +157,11 @@ class Computed:
     def write(self, output: Path) -> Finished:
         """Write the files of the contract."""
         made_by = result.write(output, self.survey, self.provenance(), self.outcome)
-        notes = (*(f"not determined: {words}" for words in left_open(self.survey)), *told(self.survey))
+        notes = (
+            *(f"not determined: {words}" for words in left_open(self.survey)),
+            *told_of_change(self.survey),
+            *told(self.survey),
+        )
         if left := (self.outcome["error"].get("verify") or {}).get("not_taken_off"):
             notes = (*notes, f"NOT taken off the verification survey: {left}")
         if isinstance(self.survey.source, Source):

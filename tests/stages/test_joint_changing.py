@@ -45,6 +45,7 @@ def test_a_later_survey_is_calibrated_for_its_date(tmp_path: Path) -> None:
     done = run(tmp_path, STAGES.format("matrices: linear, offsets: common"), further=further)
     assert done.exit_code == 0, done.output
     assert "a rotation that all sensors share between surveys" in done.output
+    assert "with the date: C changes by up to" in done.output
     calibration = tmp_path / "out/calibration.nc"
     tree, matrix = matrix_of(calibration)
     assert length_error(matrix, DATES[0]) < 3e-5 < length_error(matrix, LATER)
@@ -63,7 +64,7 @@ def test_a_later_survey_is_calibrated_for_its_date(tmp_path: Path) -> None:
     assert list(tree["calibration/survey_date"].values) == [f"{d}T00:00:00Z" for d in DATES]
     applied = command("apply", calibration, tmp_path / "e.h5", "--save-calibration", tmp_path / "saved.nc")
     assert applied.exit_code == 0, applied.output
-    assert f"of {LATER}, extrapolated: 1 years after the last survey" in applied.output
+    assert f"of {LATER}, extrapolated: 1.00 years after the last survey" in applied.output
     with xr.open_datatree(tmp_path / "e.calibrated.nc", engine="h5netcdf", decode_times=False) as found:
         b, tensor = found["calibrated/b"].values, found["calibrated/tensor"].values
         tensor_std = found["calibrated/tensor_std"].values
