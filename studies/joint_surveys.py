@@ -79,6 +79,36 @@ CASES: dict[str, Sequence[tuple[str, Case | changing_cases.Case]]] = {
 }  # fmt: skip
 
 
+LATER = "A survey at another date"
+_SIX = (0.0, 0.3, 0.8, 1.4, 1.9, 2.4)
+LATER_CASES = [
+    (f"{words}, {years:g} years after the first", years,
+     changing_cases.Case(samples=(100,) * len(dates), years=dates, offsets=offsets, tilt_deg=40.0, scatter=scatter))
+    for words, dates, years, offsets, scatter in (
+        ("6 surveys in 2.4 years, common offsets", _SIX, 1.0, "common", 0.0),
+        ("6 surveys in 2.4 years, common offsets", _SIX, 4.0, "common", 0.0),
+        ("6 surveys in 2.4 years, offsets linear", _SIX, 4.0, "linear", 0.0),
+        ("the same, C scattered by 1e-4 about the line", _SIX, 4.0, "linear", 1e-4),
+        ("3 surveys in 2 years, C scattered by 1e-4 about the line", (0.0, 1.0, 2.0), 3.0, "common", 1e-4),
+    )
+]  # fmt: skip
+
+
+def later_table(runs: int) -> None:
+    """Print the table of surveys that were not in the fit."""
+    print(f"## {LATER}\n")
+    print("| case | fits | variance of standardised errors | inside 95 % | the same of the rates | inside 95 % |")
+    print("|---|---|---|---|---|---|", flush=True)
+    for words, years, case in LATER_CASES:
+        draws = [changing_cases.at_another_date(changing_cases.surveys(s, case), years, s) for s in range(runs)]
+        told = []
+        for values in zip(*draws, strict=True):
+            pooled = np.array(values)
+            told.append(f"{np.mean(pooled**2):.3f} | {100 * np.mean(np.abs(pooled) < 1.96):.1f} %")
+        print(f"| {words} | {runs} | {' | '.join(told)} |", flush=True)
+    print()
+
+
 def errors_of(seed: int, case: Case | changing_cases.Case) -> several_cases.Errors:
     """Of one draw."""
     if isinstance(case, changing_cases.Case):
@@ -109,11 +139,13 @@ def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--runs", type=int, default=200)
-    parser.add_argument("--table", choices=list(CASES), help="one of them alone")
+    parser.add_argument("--table", choices=[*CASES, LATER], help="one of them alone")
     chosen = parser.parse_args()
     for name, cases in CASES.items():
         if chosen.table in (None, name):
             table(name, cases, chosen.runs)
+    if chosen.table in (None, LATER):
+        later_table(chosen.runs)
 
 
 if __name__ == "__main__":

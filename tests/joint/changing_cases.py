@@ -11,7 +11,9 @@ from several_cases import Errors, turned
 from magtensor.calibration.joint import nearest_frame
 from magtensor.calibration.surveys.changing import ChangingFit, fit_changing
 from magtensor.calibration.surveys.covariance import covariance_of
+from magtensor.calibration.surveys.dated import dated
 from magtensor.calibration.surveys.samples import Samples, joined
+from magtensor.calibration.surveys.straight import straight
 
 
 @dataclass(frozen=True)
@@ -153,3 +155,21 @@ def errors(truth: Truth) -> Errors:
     z = error / std
     square = float(np.sum((vectors[:, seen].T @ z) ** 2 / values[seen])) / rank
     return Errors(z, square, float(error @ bound_information(truth) @ error) / rank)
+
+
+def at_another_date(truth: Truth, years: float, seed: int) -> tuple[Array, Array]:
+    """Errors over their standard deviations, so many years after the first survey: (S, 12) of C^-1 and o of a survey
+    that was not in the fit, its C off the line by as much as those of the others; and (S, 9) of the rate."""
+    fit, case = fitted(truth), truth.case
+    later = dated(fit, straight(fit), 0).after(years)
+    t = truth.since[0] + years
+    rng = np.random.default_rng([seed, 1])
+    line = truth.forward[0] + t * truth.forward[1]
+    own = line + without_common_rotation(case.scatter * rng.standard_normal(line.shape))
+    offset = truth.offset[0] + (t * truth.offset[1] if case.offsets == "linear" else 0.0)
+    off = later.calibration.matrix - np.linalg.inv(own)
+    error = np.concatenate([off.reshape(-1, 9), later.calibration.offset - offset], axis=1)
+    std = np.sqrt(np.diag(later.calibration.covariance)).reshape(-1, 12)
+    rate = later.change.rate - truth.forward[1] @ np.linalg.inv(line)
+    of_rate = np.sqrt(np.diag(later.change.covariance).reshape(2, -1, 12)[1, :, :9])
+    return error / std, rate.reshape(-1, 9) / of_rate

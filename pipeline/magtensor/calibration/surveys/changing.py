@@ -33,6 +33,7 @@ LEAST_SPAN = 1.0 / 365.25  # years between the first and the last survey
 _ROUNDS = 12
 _SETTLED = 0.01  # of the noise
 _MOST_STEPS = 60
+_LEAST_SHARE = 1e-6  # of a step
 
 
 @dataclass(frozen=True)
@@ -137,33 +138,33 @@ def _start(alike: SurveysFit, design: Design) -> Array:
 def _maximised(
     samples: Samples, alike: SurveysFit, design: Design, parameters: Array
 ) -> tuple[Array, tuple[Said, ...]]:
-    """The parameters of least cost, by damped scoring, and what every survey says there."""
+    """The parameters of least cost, by scoring, and what every survey says there."""
     surveys = each_of(samples.at(alike.keep), alike.data)
     jacobians, free = [design.whitened(k) for k in range(len(surveys))], design.free()
 
     def at(where: Array) -> tuple[Said, ...]:
         return tuple(said(one) for one in _seen(surveys, design, where))
 
-    here, damping = at(parameters), 0.0
+    here = at(parameters)
     for _ in range(_MOST_STEPS):
         score = np.sum([j.T @ one.score for j, one in zip(jacobians, here, strict=True)], axis=0)
-        information = summed_up(jacobians, [one.information for one in here])
-        cost = sum(one.cost for one in here)
+        step = inverse_in(free, summed_up(jacobians, [one.information for one in here])) @ score
+        cost, promised = sum(one.cost for one in here), float(score @ step)
         freedom = max(sum(one.samples for one in here) * (len(design.noise) - 2) - len(parameters), 1)
-        step = inverse_in(free, information) @ score
-        if float(score @ step) < 1e-6 * cost / freedom:  # of 1e-3 standard deviations
+        if promised < 1e-6 * cost / freedom:  # of 1e-3 standard deviations
             return parameters, here
-        if damping:
-            step = inverse_in(free, information + damping * np.diag(np.diag(information))) @ score
-        there = at(parameters + step)
-        after = sum(one.cost for one in there)
-        # the scores leave out products of noise with noise, so that the last digits of the cost may rise
-        if np.isfinite(after) and after <= cost + 1e-6 * cost / freedom:
-            parameters, here, damping = parameters + step, there, damping / 10 if damping > 1e-9 else 0.0
-            continue
-        damping = max(10 * damping, 1e-6)
-        if damping > 1e6:
+        share = 1.0
+        while share > _LEAST_SHARE:
+            there = at(parameters + share * step)
+            rise = sum(one.cost for one in there) - cost
+            if rise <= 1e-12 * cost:
+                break
+            # along the step the cost is next to a parabola, which begins with the slope -2 promised
+            best = share**2 * promised / (rise + 2.0 * share * promised)
+            share = max(best, share / 10.0) if np.isfinite(rise) else share / 10.0
+        else:
             break
+        parameters, here = parameters + share * step, there
     raise NotEnoughData("the fit does not converge", hint="look for disturbed samples, or add attitudes")
 
 

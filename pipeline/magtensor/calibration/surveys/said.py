@@ -14,9 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from magtensor.calibration.joint_covariance import SYMMETRIC as PLACES
+from magtensor.calibration.maximum_likelihood import along
 from magtensor.calibration.types import Array
 
-from .directions import Sighting
+from .directions import Sighting, across
 from .samples import Samples
 from .sums import SYMMETRIC, InPlane, Sums, summed
 
@@ -128,9 +129,23 @@ def said(seen: View) -> Said:
     sums = summed(seen.data, seen.matrix, np.zeros((1, 3)))
     to_field = field_change(seen.matrix @ seen.basis.T, seen.data.free)
     one_more = np.column_stack([seen.field, np.ones(len(seen.residual))])
-    score = (seen.residual.T @ one_more).ravel() + to_field.T @ sums.gradient
+    score = seen.residual.T @ one_more
+    score[:, :3] -= seen.residual.T @ _pull(seen, sums.total_field)  # W^+ turns with W
+    score = score.ravel() + to_field.T @ sums.gradient
     perpendicular = np.eye(len(seen.basis)) - seen.basis @ seen.basis.T
     return Said(len(one_more), float(np.sum(seen.residual**2)), sums, to_field, perpendicular, score)
+
+
+def _pull(seen: View, total_field: Array) -> Array:
+    """(n, 3): half the derivative of the cost with b, times (W' W)^-1."""
+    data = seen.data
+    inward = along(seen.matrix, np.zeros(3), data.y.T, total_field, data.reference_noise)
+    slope = (inward.unit * inward.residual * inward.inverse_std).T
+    if data.sighting is not None:
+        side = across(data.sighting, slice(None), seen.field, inward.length - total_field)
+        slope = slope + np.einsum("nk,nki->ni", side.residual, side.slope)
+    out: Array = slope @ seen.matrix @ seen.matrix.T
+    return out
 
 
 def field_change(inverse: Array, free: int) -> Array:
