@@ -82,7 +82,7 @@ CASES: dict[str, Sequence[tuple[str, Case | changing_cases.Case]]] = {
 LATER = "A survey at another date"
 _SIX = (0.0, 0.3, 0.8, 1.4, 1.9, 2.4)
 LATER_CASES = [
-    (f"{words}, {years:g} years after the first", years,
+    (f"{words}, {years:g} year{'s' * (years != 1)} after the first", years,
      changing_cases.Case(samples=(100,) * len(dates), years=dates, offsets=offsets, tilt_deg=40.0, scatter=scatter))
     for words, dates, years, offsets, scatter in (
         ("6 surveys in 2.4 years, common offsets", _SIX, 1.0, "common", 0.0),
