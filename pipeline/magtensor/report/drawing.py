@@ -41,7 +41,7 @@ MOST_SENSORS = 12  # rows of a picture
 STYLE: dict[Any, Any] = {
     "svg.fonttype": "none", "svg.hashsalt": "magtensor", "text.parse_math": False, "font.size": 8.5,
     "font.family": ["DejaVu Sans"], "axes.titlesize": 8.5, "axes.titleweight": "bold", "axes.titlelocation": "left",
-    "axes.titlepad": 4.0, "axes.labelsize": 8.5, "axes.linewidth": 0.7, "axes.edgecolor": MUTED,
+    "axes.titlepad": 4.0, "axes.titley": 1.0, "axes.labelsize": 8.5, "axes.linewidth": 0.7, "axes.edgecolor": MUTED,
     "axes.labelcolor": INK, "axes.titlecolor": INK, "axes.facecolor": "none", "axes.spines.top": False,
     "axes.spines.right": False, "axes.grid": True, "axes.axisbelow": True, "axes.formatter.useoffset": False,
     "axes.unicode_minus": True, "grid.color": GRID, "grid.linewidth": 0.6, "text.color": INK, "xtick.color": MUTED,
