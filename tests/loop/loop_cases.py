@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +13,11 @@ from numpy.typing import NDArray
 
 from magtensor.loop.model import Fitting, Record, State, joint_state
 from magtensor.loop.record import record_of
+from magtensor.loop.screening import profiled
+from magtensor.loop.settings import EventTimes
 from magtensor.preparing import empty_survey, load_as
 from magtensor.recipe.plan import read_plan
+from magtensor.registry import Registry
 from magtensor.runner import run
 from magtensor.simulate import simulate, write
 from magtensor.verdict import verdict
@@ -70,14 +73,28 @@ def survey_file(folder: Path, description: dict[str, Any], name: str = "survey.h
     return path
 
 
+def lasting_effects() -> list[str]:
+    """The catalogue without single events, whose times make most of its settings."""
+    registry = Registry.load()
+    models = [registry.find("error_model", name) for name in registry.names("error_model")]
+    return [m.name for m in models if not any(isinstance(g, EventTimes) for g in profiled(m).values())]
+
+
 def verdict_of(
-    folder: Path, description: dict[str, Any], change: Callable[[Path], None] | None = None
+    folder: Path,
+    description: dict[str, Any],
+    change: Callable[[Path], None] | None = None,
+    models: Sequence[str] | None = None,
 ) -> dict[str, Any]:
-    """What `magtensor run recipes/closed_loop.yaml` would say of a survey; `change` may spoil its file before."""
+    """What `magtensor run recipes/closed_loop.yaml` would say of a survey; `change` may spoil its file before.
+
+    With `models` the loop looks for these only.
+    """
     path = survey_file(folder, description)
     if change is not None:
         change(path)
-    planned = read_plan(RECIPE, survey=path)
+    only = [] if models is None else [f"stages.close_loop.search=[{', '.join(models)}]"]
+    planned = read_plan(RECIPE, survey=path, overrides=only)
     found: dict[str, Any] = json.loads(json.dumps(verdict(run(planned, empty_survey(planned)).survey)))
     return found
 

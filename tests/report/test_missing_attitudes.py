@@ -20,6 +20,8 @@ from magtensor.errors import NotEnoughData
 from magtensor.report import attitude_pictures
 from magtensor.report.missing_attitudes import Seen, in_words, picture
 
+pytestmark = pytest.mark.pictures
+
 FIELD = 50_000.0
 SINCE = "seconds since 2026-03-21T09:00:00Z"
 JOINT: dict[str, Any] = {"title": "joint", "stages": [{"load": {}}, {"detrend_diurnal": {}}, "calibrate_joint"]}

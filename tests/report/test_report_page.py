@@ -25,6 +25,7 @@ from magtensor.survey.flags import Flag
 from magtensor.survey.model import Survey
 from magtensor.verdict import verdict
 
+pytestmark = pytest.mark.pictures
 VOID = {"meta", "img", "br", "link", "input", "hr"}
 Write = Callable[..., Path]
 

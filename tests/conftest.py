@@ -1,0 +1,18 @@
+"""What all tests share."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+
+
+@pytest.fixture(autouse=True)
+def _pictures_where_they_are_the_subject(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Reports of this process have no pictures, which take longer than most runs, but in tests marked `pictures`."""
+    if request.node.get_closest_marker("pictures"):
+        yield
+        return
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("magtensor.report.gallery.gallery", lambda content: [])
+        yield
