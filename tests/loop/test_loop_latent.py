@@ -13,7 +13,7 @@ from magtensor.calibration.types import ArrayCalibration
 from magtensor.loop.correction import corrected_raw, hidden_waveform
 from magtensor.loop.factor import noise_alone, with_factor
 from magtensor.loop.latent import ALPHA, shared_words, sought, tried_source
-from magtensor.loop.model import Adopted, Fitting, Record
+from magtensor.loop.model import Adopted, Fitting, Record, joint_state
 from magtensor.loop.switching import two_levels
 from magtensor.loop.waveform import course_of, free_directions
 from magtensor.registry import Registry
@@ -239,3 +239,17 @@ def test_what_follows_the_attitude_is_no_source(rank: int) -> None:
         if rank == 1
         else "one waveform does not explain what the sensors share"
     )
+
+
+@pytest.mark.parametrize("alike", [True, False])
+def test_what_an_effect_may_have_left_is_no_source(alike: bool) -> None:
+    """A waveform that moves the sensors as an adopted effect does, and one that moves them otherwise."""
+    pump = np.cos(np.arange(N) / 33.0)
+    effect = VECTORS if alike else np.random.default_rng(9).standard_normal((4, 3))
+    record = synthetic(2, N, added=3.0 * WAVE[:, None, None] * VECTORS + 40.0 * pump[:, None, None] * effect)
+    known = replace(record, logged={"pump": pump}, means={"pump": np.zeros(())}, units={"pump": "A"})
+    response = Adopted(Registry.load().find("error_model", "channel_response"), {"channel": "pump"})
+    state = joint_state(known, [response], Fitting())
+    found = sought(state, known)
+    assert found is not None and found.significant
+    assert found.objection == ("the sensors feel it as they feel channel_response, which may leave it" if alike else "")

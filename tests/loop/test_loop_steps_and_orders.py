@@ -71,6 +71,16 @@ def test_the_order_of_a_temperature_is_the_lowest_that_does(
     assert (adopted.name, adopted.settings["order"]) == ("temperature_offset", order)
 
 
+def test_two_ways_of_the_heat_are_two_lags_of_one_thermometer(tmp_path: Path) -> None:
+    effects = [LINE | {"lag_s": lag, "rms_nT": 1.0} for lag in (10.0, 200.0)]
+    models = ("temperature_offset", "channel_response", "temperature_rate", "offset_drift")
+    found = searched(loaded(tmp_path, scenario(21, *effects)), *models)
+    assert {a.name for a in found.last.adopted} == {"temperature_offset"}
+    # the record's own heat came in before it began: some seconds and a tenth of the longer lag
+    lags = sorted(a.settings["lag_s"] for a in found.last.adopted)
+    np.testing.assert_allclose(lags, [10.0, 200.0], rtol=0.2, atol=6.0)
+
+
 VISCOUS = ("viscous_magnetisation", "hysteresis", "eddy_current", "sampling_lag", "bandwidth")
 
 

@@ -22,6 +22,7 @@ from magtensor.loop.assessment import Assessment, estimated
 from magtensor.loop.colour import Colour, colour_of
 from magtensor.loop.direction import attitude_series
 from magtensor.loop.factor import Factors, Groups, noise_alone, with_factor
+from magtensor.loop.likeness import effect_along, followed
 from magtensor.loop.log_noise import brought_in
 from magtensor.loop.model import Adopted, Fitting, Record, State, excitation_of, joint_state, without
 from magtensor.loop.residual import Residual
@@ -35,10 +36,7 @@ LEAST_SENSORS = 3  # from here on noise of single sensors does not imitate a fac
 LEAST_BAND = 6  # coefficients of the lowest band for each value across
 _PARTS = 6  # of a band, in which the noise of different values may have different power
 SECOND = 0.1  # a second factor this strong beside the first: not one waveform
-LIKE_A_CHANNEL = 0.7  # correlation from which a logged channel is the suspect and no hidden source
-MOST_LAG = 0.1  # of the survey, in which a channel is compared with the waveform
 _SETTLING = 3  # rounds in which colour and field settle
-COMPARED = 400  # points at which it is
 
 
 @dataclass(frozen=True)
@@ -112,6 +110,8 @@ def sought(state: State, record: Record) -> Sought | None:
         objection = "the sensors do not predict each other with it on held-out stretches"
     elif like is not None:
         objection = f"its waveform follows channel {like[0]}"
+    elif left_by := effect_along(state, basis, seen):
+        objection = f"the sensors feel it as they feel {left_by}, which may leave it"
     elif _second(test, basis, factors) > SECOND:
         objection = "one waveform does not explain what the sensors share"
     return Sought(
@@ -384,35 +384,3 @@ def shared_words(found: Sought, sensors: Sequence[str]) -> str:
         )
     words += " and follows no logged channel"
     return words + (f"; not adopted: {found.objection}" if found.objection else "")
-
-
-def followed(time: Array, values: Array, record: Record) -> tuple[str, float, int, float] | None:
-    """The channel, lag, power and correlation that come nearest to a waveform, if they come near."""
-    points = np.linspace(time[0], time[-1], min(COMPARED, len(time)))
-    step = points[1] - points[0]
-    wave = _means(time, values, points)
-    best: tuple[str, float, int, float] | None = None
-    for name, channel in record.logged.items():
-        for column in channel.reshape(len(channel), -1).T:
-            sampled = _means(record.time, column, points)
-            for power in (1, 2, 3):
-                series = sampled**power
-                for shift in range(max(1, int(MOST_LAG * len(points))) + 1):
-                    a, b = wave[shift:], series[: len(series) - shift]
-                    if not a.std() > 0 or not b.std() > 0:
-                        continue
-                    c = float(np.corrcoef(a, b)[0, 1])
-                    if best is None or abs(c) > abs(best[3]) + 0.01:
-                        best = (name, shift * step, power, c)
-    return best if best is not None and abs(best[3]) > LIKE_A_CHANNEL else None
-
-
-def _means(time: Array, values: Array, points: Array) -> Array:
-    """Means of a series about points in time, those between samples from their neighbours."""
-    half = 0.5 * (points[1] - points[0])
-    total = np.concatenate([[0.0], np.cumsum(values)])
-    first, last = np.searchsorted(time, points - half), np.searchsorted(time, points + half)
-    count = last - first
-    mean = (total[last] - total[first]) / np.maximum(count, 1)
-    out: Array = np.where(count > 0, mean, np.interp(points, time, values))
-    return out

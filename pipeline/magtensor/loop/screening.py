@@ -285,24 +285,20 @@ def generic(model: Adopted) -> bool:
 
 
 def _already(state: State, model: Component, settings: Mapping[str, Any]) -> bool:
-    """Whether a model holds a channel already, or a setting on a range so near that the two could not be told apart."""
+    """Whether a model is in already with the same channel, and settings on ranges so near that the two could not be
+    told apart."""
     from magtensor.loop.settings import AnyChannel
 
     grids = profiled(model)
     channels = {n for n, g in grids.items() if isinstance(g, AnyChannel)}
     ranges = {n for n, g in grids.items() if _of_ratios(g)}
-    others = set(grids) - channels - ranges
-    for adopted in state.adopted:
-        if adopted.name != model.name:
-            continue
-        if channels:
-            if all(adopted.settings.get(c) == settings.get(c) for c in channels):
-                return True
-        elif all(adopted.settings.get(o) == settings.get(o) for o in others) and not any(
-            _apart(adopted.settings[n], settings[n]) for n in ranges
-        ):
-            return True
-    return False
+    same = channels or set(grids) - ranges
+    return any(
+        all(adopted.settings.get(n) == settings.get(n) for n in same)
+        and not any(_apart(adopted.settings[n], settings[n]) for n in ranges)
+        for adopted in state.adopted
+        if adopted.name == model.name
+    )
 
 
 def _apart(one: float, other: float) -> bool:

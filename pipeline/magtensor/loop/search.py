@@ -35,6 +35,8 @@ KEEP_ALPHA = 0.01  # an adopted effect that is no longer significant at this lev
 MOST_EFFECTS = 8
 ROUNDING = 1e-4  # mean square of the whitened residual: far below the least noise that any sensor is believed to have
 POLISH = 0.1  # of a setting, to either side
+_SWEEPS = 6  # over all settings, where two models of one kind are in
+_RESTS = 0.02  # relative: a setting that moves no further is settled
 
 
 @dataclass(frozen=True)
@@ -346,32 +348,43 @@ def _without_others(state: State, which: int, sensors: tuple[str, ...]) -> tuple
 def _polished(record: Record, state: State, how: Fitting) -> State:
     """The settings on a range, sought once more now that everything is fitted together; a setting that is a little
     off leaves a residual that another model would be adopted for."""
-    for number, model in enumerate(state.adopted):
-        for name, grid in profiled(model.component).items():
-            if not isinstance(grid, Range) or not state.adopted[number].settings[name]:
-                continue
-            now = state.adopted[number]
-            own = _slices(state)[number]
-            assert state.terms is not None
-            mine = state.terms.only(range(own.start, own.stop))
-            others = [i for i in range(state.terms.count) if not own.start <= i < own.stop]
-            back = put_back(state.residual, mine, state.theta[number])
-            score = Scorer(back, state.terms.only(others) if others else None, state.colours)
-            at = state
-
-            def gain(
-                value: float, name: str = name, now: Adopted = now, score: Scorer = score, at: State = at
-            ) -> float:
-                trial = Adopted(now.component, {**now.settings, name: value}, now.sensors)
-                return score(trial.terms(at.excitation).at(at.residual.samples))
-
-            here = float(now.settings[name])
-            best = golden(gain, here * (1 - POLISH), here * (1 + POLISH), here)
-            if best != here:
+    for _ in range(_SWEEPS):
+        moved = False
+        for number, model in enumerate(state.adopted):
+            for name, grid in profiled(model.component).items():
+                if not isinstance(grid, Range) or not state.adopted[number].settings[name]:
+                    continue
+                here = float(state.adopted[number].settings[name])
+                best = _sought_anew(state, number, name)
+                if best == here:
+                    continue
+                moved |= abs(best - here) > _RESTS * abs(here)
+                now = state.adopted[number]
                 changed = Adopted(now.component, {**now.settings, name: best}, now.sensors)
                 models = [changed if i == number else a for i, a in enumerate(state.adopted)]
                 state = joint_state(record, models, how, state.theta)
+        # one setting of a kind rests at once; of two, one moves as the other does
+        if not moved or len({a.name for a in state.adopted}) == len(state.adopted):
+            break
     return state
+
+
+def _sought_anew(state: State, number: int, name: str) -> float:
+    """A setting of one of the adopted models near where it is, by what the model explains beside the others."""
+    now = state.adopted[number]
+    own = _slices(state)[number]
+    assert state.terms is not None
+    mine = state.terms.only(range(own.start, own.stop))
+    others = [i for i in range(state.terms.count) if not own.start <= i < own.stop]
+    back = put_back(state.residual, mine, state.theta[number])
+    score = Scorer(back, state.terms.only(others) if others else None, state.colours)
+
+    def gain(value: float) -> float:
+        changed = Adopted(now.component, {**now.settings, name: value}, now.sensors)
+        return score(changed.terms(state.excitation).at(state.residual.samples))
+
+    here = float(now.settings[name])
+    return golden(gain, here * (1 - POLISH), here * (1 + POLISH), here)
 
 
 def with_lines(state: State, record: Record, lines: Sequence[float] | None = None) -> State:
