@@ -150,6 +150,16 @@ def test_a_line_is_found_and_noise_has_none() -> None:
     assert min(small) > 1e-4
 
 
+def test_slow_noise_on_a_platform_that_turns_is_no_line() -> None:
+    """C takes a part of the noise, which then turns with the platform, here within a few samples."""
+    smallest = []
+    for seed in range(10):
+        walks = np.cumsum(np.random.default_rng(seed).standard_normal((1600, 4, 3)), axis=0)
+        record = synthetic(40 + seed, 1600, added=walks, turning_s=3.0)
+        smallest.append(spectral_lines(linear_state(record).residual, record.time)[0][2])
+    assert min(smallest) > 0.01
+
+
 def _of(seed: int) -> tuple:
     state, record = with_line(seed, 0.0)
     return state.residual, record.time

@@ -18,6 +18,7 @@ from magtensor.calibration.types import Array
 _COLUMNS = 16  # filtered at a time
 _SHORT = np.array([1.0, 3.0, 10.0])  # time constants in samples
 _LEAST_OF_SHORT = 100  # of them in a survey, or it is not short
+_SETTLING = 3  # rounds in which a colour and what goes with the field settle
 
 
 @dataclass(frozen=True)
@@ -109,6 +110,20 @@ def colour_of(series: Array, freedom: float | None = None, *, stiff: bool = Fals
     if relative[1] < 1.05:
         return Colour(None, white)
     return Colour(relative, white)
+
+
+def beside_the_field(series: Array, affine: Array) -> tuple[Array, Colour]:
+    """(N,) or (N, K) without what of it goes with the field, told apart by colour, and the colour of what is left.
+
+    The fit holds its noise for white. Of slow noise, each output's own, its C and o take a part that turns with the
+    field, and so put one waveform into all of them.
+    """
+    left = series
+    for _ in range(_SETTLING):
+        colour = colour_of(left.reshape(len(left), -1))
+        taken = np.linalg.lstsq(colour.whiten(affine), colour.whiten(series), rcond=1e-12)[0]
+        left = series - affine @ taken
+    return left, colour
 
 
 def _relaxations(frequency: Array, n: int) -> Array:

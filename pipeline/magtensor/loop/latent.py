@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from magtensor.calibration.types import Array
 from magtensor.components import Component
 from magtensor.loop.assessment import Assessment, estimated
-from magtensor.loop.colour import Colour, colour_of
+from magtensor.loop.colour import beside_the_field
 from magtensor.loop.direction import attitude_series
 from magtensor.loop.factor import Factors, Groups, noise_alone, with_factor
 from magtensor.loop.likeness import effect_along, followed
@@ -36,7 +36,6 @@ LEAST_SENSORS = 3  # from here on noise of single sensors does not imitate a fac
 LEAST_BAND = 6  # coefficients of the lowest band for each value across
 _PARTS = 6  # of a band, in which the noise of different values may have different power
 SECOND = 0.1  # a second factor this strong beside the first: not one waveform
-_SETTLING = 3  # rounds in which colour and field settle
 
 
 @dataclass(frozen=True)
@@ -91,7 +90,7 @@ def sought(state: State, record: Record) -> Sought | None:
     sensors = len(residual.noise) // 3
     told = sensors >= LEAST_SENSORS
     groups: Groups = [np.arange(3 * s, 3 * s + 3) for s in range(sensors)] if told else _outputs(basis)
-    z, colour = _beside_the_field(residual.across @ basis, residual.affine)
+    z, colour = beside_the_field(residual.across @ basis, residual.affine)
     test = _strongest(colour.whiten(z), basis, groups)
     factors = with_factor(test.covariance, basis, groups, test.alone)
     course = _told_from_the_field(residual, held, factors.direction)
@@ -177,22 +176,8 @@ def _told_from_the_field(residual: Residual, held: Array, direction: Array) -> C
     free = free_directions(held)
     seen = free @ (free.T @ direction)
     series = residual.across @ seen / (seen @ seen)
-    left, _ = _beside_the_field(series, residual.affine)
+    left, _ = beside_the_field(series, residual.affine)
     return course_of(residual.across + np.outer(left - series, seen), held, direction)
-
-
-def _beside_the_field(series: Array, affine: Array) -> tuple[Array, Colour]:
-    """(N,) or (N, K) without what of it goes with the field, told apart by colour, and the colour of what is left.
-
-    The fit holds its noise for white. Of slow noise, each output's own, its C and o take a part that turns with the
-    field, and so put one waveform into all of them.
-    """
-    left = series
-    for _ in range(_SETTLING):
-        colour = colour_of(left.reshape(len(left), -1))
-        taken = np.linalg.lstsq(colour.whiten(affine), colour.whiten(series), rcond=1e-12)[0]
-        left = series - affine @ taken
-    return left, colour
 
 
 def renewed(record: Record, state: State, how: Fitting) -> tuple[Record, State]:

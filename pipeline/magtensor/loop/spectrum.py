@@ -5,14 +5,16 @@ from __future__ import annotations
 import numpy as np
 
 from magtensor.calibration.types import Array
+from magtensor.loop.colour import beside_the_field
 from magtensor.loop.residual import Residual
 
 
 def spectral_lines(residual: Residual, time: Array, most: int = 5) -> list[tuple[float, float, float]]:
     """(frequency Hz, rms nT, p) of the strongest peaks of the residual across over its smooth spectrum.
 
-    p is that of the largest of all peaks under noise without lines. The lowest frequencies, where no smooth spectrum
-    can be told from a line, are left out; so are surveys that are not evenly sampled.
+    p is that of the largest of all peaks under noise without lines. What C took of slow noise turns with the platform,
+    at a rate that would seem a line, and is put back (`colour.beside_the_field`). The lowest frequencies, where no
+    smooth spectrum can be told from a line, are left out; so are surveys that are not evenly sampled.
     """
     from scipy.fft import rfft
     from scipy.stats import chi2
@@ -23,7 +25,7 @@ def spectral_lines(residual: Residual, time: Array, most: int = 5) -> list[tuple
     if np.max(np.abs(np.diff(time) - step)) > 0.5 * step:
         return []
     values, vectors = np.linalg.eigh(residual.projector)
-    coordinates = residual.across @ vectors[:, values > 0.5]
+    coordinates, _ = beside_the_field(residual.across @ vectors[:, values > 0.5], residual.affine)
     n, k = coordinates.shape
     # without the highest frequency of an even number of samples, which has one phase and not two
     power = np.sum(np.abs(rfft(coordinates, axis=0)) ** 2, axis=1)[1 : (n + 1) // 2] / n
