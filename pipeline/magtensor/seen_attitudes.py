@@ -10,9 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from magtensor.atomic import atomic_path, refuse_overwriting, require_writable
-from magtensor.calibration.coverage import Coverage, coverage, same_postures, seen_directions
-from magtensor.calibration.factors import factor
-from magtensor.calibration.quadric import NotAnEllipsoid, fit_ellipsoid, gradient_normalised
+from magtensor.calibration.coverage import Coverage, coverage_alone, same_postures, seen_directions
 from magtensor.calibration.types import Array, Mask
 from magtensor.closed_loop import loop_document
 from magtensor.errors import DataError, NotEnoughData, UsageError
@@ -122,13 +120,8 @@ def _turn(first: Array, used: Mask, other: Array, also: Mask) -> Array:
 def judged(raw: Array, total_field: Array) -> tuple[Array, Coverage]:
     """Directions (N, 3) of the field in a sensor's axes and what they determine, from raw (N, 3), total_field (N,) nT:
     with the fit of the nearest ellipsoid where there is one."""
-    try:
-        ellipsoid = fit_ellipsoid(raw, total_field, gradient_normalised)
-    except NotAnEllipsoid:
-        return seen_directions(raw, total_field, np.zeros(3)), coverage(raw, total_field)
-    matrix = factor(ellipsoid.shape, "polar")
-    found = coverage(raw, total_field, matrix=matrix, offset=ellipsoid.offset)
-    return seen_directions(raw, total_field, ellipsoid.offset), found
+    found, centre = coverage_alone(raw, total_field)
+    return seen_directions(raw, total_field, centre), found
 
 
 def _samples(planned: Plan) -> tuple[list[str], Array, Array | None]:

@@ -79,6 +79,10 @@ UNMEASURED = (
     "calibrate_joint: a change with the date needs a measured total field; one that is unknown in each survey hides a "
     "change of all sensitivities"
 )
+TWO_SIZES = (
+    "calibrate_joint: vector_reference: true knows the size of the world field, which total_field: {} would put aside; "
+    "leave total_field out, or declare another size with total_field_nT"
+)
 MEAN_OF_OWN = "calibrate_joint: offset_of: mean needs further surveys with offsets of their own"
 
 
@@ -96,7 +100,7 @@ def declares(options: Mapping[str, Any], *, several: bool = False) -> Declares:
     needs += ["attitude", "reference/world_field"] if field.vector else []
     always = tuple(p for p in COMMON if not p.startswith("residual/"))
     gives = COMMON if "total_field" in needs else always
-    uses: tuple[str, ...] = ("total_field", "segment", "attitude", "reference/world_field")
+    uses: tuple[str, ...] = ("total_field", "reference/total_field", "segment", "attitude", "reference/world_field")
     if options["error_models"]:
         uses = ("*", "reference/time", "reference/total_field")
     return Declares(
@@ -119,6 +123,8 @@ def _require_agreement(
 ) -> None:
     if attitude_std_deg is not None and not field.vector:
         raise UsageError("calibrate_joint: attitude_std_deg needs vector_reference: true; no attitude is used without")
+    if field.vector and not field.measured and field.declared is None:
+        raise UsageError(TWO_SIZES.format(field.kind))
     for name, value in (("matrices", matrices), ("offsets", offsets)):
         if value == "linear" and not several:
             raise UsageError(DATED.format(name))
@@ -218,7 +224,8 @@ def calibrate_joint(
             calibration, doubted = _from_recording(recording, reference_noise_nT, robust, worst_error)
         extra = {}
         if not field.measured:
-            calibration, _ = _without_reference(calibration, field, float(size[0]))
+            aside = joint_surveys.has_measured_field(survey)
+            calibration, _ = _without_reference(calibration, field, float(size[0]), aside)
     given = common_frame(survey, calibration, "joint") | extra
     if offsets_of := extra.pop("offset_of", ""):
         dims, values, attributes = given["calibration/matrix"]
@@ -302,18 +309,21 @@ def _flagged(survey: Survey, doubted: np.ndarray) -> dict[str, Any]:
 
 
 def _without_reference(
-    calibration: ArrayCalibration, field: joint_surveys.Field, size: float
+    calibration: ArrayCalibration, field: joint_surveys.Field, size: float, aside: bool
 ) -> tuple[ArrayCalibration, float]:
-    """The scale that nothing measured put by declaration or by convention, said to be so, and the factor it took."""
-    from magtensor.calibration.common_scale import DECLARED, nominal_scale
+    """The scale that nothing tells put by declaration or by convention, said to be so, and the factor it took; aside:
+    a measured total field would have told it."""
+    from magtensor.calibration.common_scale import ASIDE, DECLARED, UNMEASURED, nominal_scale
+
+    why = ASIDE if aside else UNMEASURED
 
     if field.declared is not None:
-        words = (*calibration.unobservable, f"{DECLARED} ({field.declared:g} nT)")
+        words = (*calibration.unobservable, f"{DECLARED} ({field.declared:g} nT); {why}")
         return replace(calibration, unobservable=words), 1.0
     scaled, factor, std = nominal_scale(calibration)
     facts: dict[str, float | str] = {"total_field_nT": size * factor, "total_field_std_nT": size * std}
     *others, scale = scaled.unobservable
-    words = (*others, f"{scale} (it is then {size * factor:.6g} nT, to {size * std:.2g} nT)")
+    words = (*others, f"{scale}; {why} (it is then {size * factor:.6g} nT, to {size * std:.2g} nT)")
     return replace(scaled, diagnostics=calibration.diagnostics | facts, unobservable=words), factor
 
 
@@ -343,7 +353,9 @@ def _from_surveys(
         found = calibrated_surveys(fit)
     calibration, factor = found.of_another() if mean else found.of_survey(0), 1.0
     if not field.measured:
-        calibration, factor = _without_reference(calibration, field, float(np.mean(fit.found.sums.total_field)))
+        aside = any(joint_surveys.has_measured_field(one) for _, one in joint_surveys.named_surveys(survey))
+        typical = float(np.mean(fit.found.sums.total_field))
+        calibration, factor = _without_reference(calibration, field, typical, aside)
         found = found if field.declared is not None else found.nominal()
     else:
         calibration = joint_surveys.with_declared_size(survey, field, calibration)

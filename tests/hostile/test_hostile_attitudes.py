@@ -69,3 +69,11 @@ def test_twelve_postures_are_enough(tmp_path: Path, bench: Any, recipe: str) -> 
     mean, difference, _ = outcome.error_against(true_field(survey), time)
     assert mean < 1.0
     assert difference < 1.0
+
+
+def test_hardly_any_tilt(tmp_path: Path, bench: Any) -> None:
+    """A fit that does not converge for want of attitudes does not blame the samples."""
+    survey = simulated(tmp_path, {"type": "limited_tilt", "duration_s": 400.0, "tilt_deg": 1.0}, noise=1.0)
+    bench("joint", survey).refused(
+        "do not determine", "condition number", "largest cone without a sample", "a picture of"
+    )

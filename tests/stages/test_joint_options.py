@@ -116,7 +116,7 @@ def test_without_a_reference(tmp_path: Path) -> None:
     written(tmp_path / "a.h5", 3)
     done = run(tmp_path, "[load, calibrate_joint: {total_field: constant}, assemble_tensor, qc]")
     assert done.exit_code == 0, done.output
-    assert "one scale that all sensors share" in done.output
+    assert "one scale that all sensors share" in done.output and "no total field was measured" in done.output
     tree, matrix = matrix_of(tmp_path / "out" / "calibration.nc")
     assert np.mean(np.log(np.linalg.det(matrix))) == pytest.approx(0.0, abs=1e-12)
     off = misalignment(matrix)
@@ -160,6 +160,17 @@ def test_a_declared_total_field(tmp_path: Path) -> None:
     assert done.exit_code == 0, done.output
     assert "the total field was declared" in done.output
     assert abs(misalignment(matrix_of(tmp_path / "out/calibration.nc")[1])).max() < 2e-5
+
+
+@pytest.mark.parametrize("kind", ["constant", "per_survey", "per_segment", "constant, total_field_nT: 48500"])
+def test_a_measured_total_field_that_is_put_aside_is_not_called_missing(tmp_path: Path, kind: str) -> None:
+    written(tmp_path / "a.h5", 3, samples=600, reference=True)
+    done = run(tmp_path, f"[load, detrend_diurnal, calibrate_joint: {{total_field: {kind}}}]")
+    unprepared = run(tmp_path, f"[load, calibrate_joint: {{total_field: {kind}}}]")
+    for one in (done, unprepared):
+        assert one.exit_code == 0, one.output
+        assert "the measured total field was put aside, as asked" in one.output
+        assert "no total field was measured" not in one.output
 
 
 def test_unknown_in_every_segment(tmp_path: Path) -> None:
@@ -258,6 +269,7 @@ def test_a_vector_reference_ties_the_frame(tmp_path: Path) -> None:
         ("{total_field: per_segment}", ", with: missing.h5", 3, "missing.h5"),
         ("{total_field_nT: 48.5}", "", 2, "greater than 1000"),
         ("{total_field_nT: 48500}", "", 2, "say total_field: constant"),
+        ("{vector_reference: true, total_field: constant}", "", 2, "knows the size of the world field"),
         ("{attitude_std_deg: 0.3}", "", 2, "r.yaml:3: stages[2].calibrate_joint: attitude_std_deg needs vector"),
         ("{offset_of: mean, offsets: common}", ", with: a.h5", 2, "offsets of their own"),
     ],

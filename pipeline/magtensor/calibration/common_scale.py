@@ -14,8 +14,10 @@ import numpy as np
 from .types import Array, ArrayCalibration
 
 COMMON_SCALE = "one scale that all sensors share"  # how the words begin that name the scale as unobservable
-UNKNOWN = f"{COMMON_SCALE}: the mean sensitivity was taken as nominal, as no total field was measured"
-DECLARED = f"{COMMON_SCALE}: the total field was declared, not measured"
+UNMEASURED = "no total field was measured"
+ASIDE = "the measured total field was put aside, as asked"  # by somebody who distrusts the reference
+UNKNOWN = f"{COMMON_SCALE}: the mean sensitivity was taken as nominal"
+DECLARED = f"{COMMON_SCALE}: the total field was declared"
 
 
 @dataclass(frozen=True)

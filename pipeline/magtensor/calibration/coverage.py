@@ -38,8 +38,9 @@ import numpy as np
 from magtensor.errors import MissingAttitudes, NotEnoughData
 
 from .covariance import scalar_noise
+from .factors import factor
 from .postures import Further, attitude_design, further_postures, further_together, sphere
-from .quadric import NotAnEllipsoid, ellipsoid_of, nearest_quadrics
+from .quadric import NotAnEllipsoid, ellipsoid_of, fit_ellipsoid, gradient_normalised, nearest_quadrics
 from .types import Array
 
 LEAST_SAMPLES = 10  # nine parameters and one sample to judge them by
@@ -233,6 +234,17 @@ def same_postures(found: Sequence[Coverage], unit: Sequence[Array], turn: Array)
         np.array([a.T @ a for a in designs]), turn, [len(a) for a in designs], [_held(u) for u in unit]
     )
     return [replace(own, further=further) for own, further in zip(found, together, strict=True)]
+
+
+def coverage_alone(raw: Array, total_field: Array) -> tuple[Coverage, Array]:
+    """What the samples of one sensor determine, raw (N, 3) and total_field (N,) in nT, judged with the ellipsoid that
+    is nearest to them where there is one; and its centre (3,) nT, else zero."""
+    try:
+        nearest = fit_ellipsoid(raw, total_field, gradient_normalised)
+    except NotAnEllipsoid:
+        return coverage(raw, total_field), np.zeros(3)
+    matrix = factor(nearest.shape, "polar")
+    return coverage(raw, total_field, matrix=matrix, offset=nearest.offset), nearest.offset
 
 
 def require_coverage(found: Coverage) -> None:

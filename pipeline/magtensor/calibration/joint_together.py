@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from magtensor.errors import DataError, NotEnoughData
 
 from .common_field import CommonField, common_field, output_noise
-from .coverage import coverage, require_coverage
+from .coverage import coverage_alone, require_coverage
 from .maximum_likelihood import CHUNK, ScalarFit, along, fit_scalar
 from .noise import shares_of_two
 from .scalar import checked_samples
@@ -118,7 +118,7 @@ def _scalar(plane: CommonField, part: Together, keep: Mask, reference_noise: flo
     try:
         return fit_scalar(y[keep], part.total_field[keep], reference_noise, complete)
     except DataError:
-        require_coverage(coverage(part.raw[keep, 0], part.total_field[keep]))
+        require_coverage(coverage_alone(part.raw[keep, 0], part.total_field[keep])[0])
         raise
 
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from magtensor.calibration.common_field import CommonField, common_field, output_noise
-from magtensor.calibration.coverage import WORST_ERROR, Coverage, coverage, require_coverage
+from magtensor.calibration.coverage import WORST_ERROR, Coverage, coverage_alone, require_coverage
 from magtensor.calibration.joint import nearest_frame, refuse_sensors
 from magtensor.calibration.joint_together import FALSE_REJECTION, LEAST_FOR_REJECTION, told_apart
 from magtensor.calibration.maximum_likelihood import along
@@ -224,7 +224,7 @@ def fitted(
             found = on_ellipsoid(data, shifts)
         except NotEnoughData:
             nominal = (centred + means[0])[:, 0]  # the refusal that names the missing attitudes, if they are missing
-            require_coverage(coverage(nominal, used.total_field))
+            require_coverage(coverage_alone(nominal, used.total_field)[0])
             raise
     else:
         data, found, std, wider = _sighted(data, used.direction, attitude)
