@@ -9,6 +9,7 @@ dipoles, the tensor's error before and after `--refine-rotation`, and with an at
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import copy
 import io
@@ -166,6 +167,7 @@ def table(heads: list[str], rows: list[list[str]]) -> str:
 
 
 def main() -> None:
+    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     print("# The common rotation\n\nPrinted by `python studies/common_rotation.py`; simulated data throughout.\n")
     print("## From the symmetry of the tensor alone\n")
     print(

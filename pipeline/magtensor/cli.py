@@ -15,6 +15,7 @@ from magtensor.errors import MagtensorError
 
 FILE = click.Path(path_type=Path, dir_okay=False)
 FOLDER = click.Path(path_type=Path, file_okay=False)
+READER_GONE = 141  # as of a program that SIGPIPE ends
 memory_option = click.option(
     "--memory", "memory_GiB", type=click.FloatRange(min=0, min_open=True), metavar="GIB",
     help="Work through a survey longer than this in windows.",
@@ -298,6 +299,10 @@ def status_of(arguments: list[str] | None = None) -> int:
     except click.Abort:
         click.echo("stopped", err=True)
         return 130
+    except SystemExit as error:
+        if isinstance(error.__context__, BrokenPipeError):  # click leaves so where nobody reads what is printed
+            return READER_GONE
+        raise
     except MagtensorError as error:
         _progress_end()
         click.echo(f"error: {error}", err=True)

@@ -57,10 +57,23 @@ def windows(source: Source, memory_GiB: float) -> list[slice]:
         UsageError: the survey cannot be read in windows.
     """
     samples, sensors = source.shape()
-    most = max(int((memory_GiB - RESERVED_GiB) * 2**30 / (BYTES_PER_VALUE * 3 * sensors)), LEAST_ROWS)
+    most = max(int((memory_GiB - RESERVED_GiB) * 2**30 / _bytes_per_row(sensors)), LEAST_ROWS)
     count = -(-samples // most)
     edges = np.linspace(0, samples, count + 1).astype(int)
     return [slice(int(a), int(b)) for a, b in pairwise(edges)]
+
+
+def _bytes_per_row(sensors: int) -> int:
+    return BYTES_PER_VALUE * 3 * sensors
+
+
+def too_little(source: Source, memory_GiB: float) -> tuple[str, ...]:
+    """What there is to say of a memory that not even the smallest windows keep to."""
+    samples, sensors = source.shape()
+    least = RESERVED_GiB + min(samples, LEAST_ROWS) * _bytes_per_row(sensors) / 2**30
+    if memory_GiB >= least:
+        return ()
+    return (f"--memory {memory_GiB:g} cannot be kept to: the program and its smallest windows take {least:.2g} GiB",)
 
 
 @dataclass(frozen=True)
@@ -151,7 +164,7 @@ def run_long(
             say("report")
             _report(folder, output, survey, made_by)
     notes = (*(f"not determined: {words}" for words in left_open(survey)), *told(survey))
-    return Finished(output, outcome, sentence(outcome), made_by, survey, notes)
+    return Finished(output, outcome, sentence(outcome), made_by, survey, (*too_little(source, memory_GiB), *notes))
 
 
 def apply_long(
@@ -163,9 +176,11 @@ def apply_long(
     flags: list[Flag] = []
     date: datetime | None = None
 
+    source = replace(planned, survey=planned.survey_for(survey)).source()
+
     def parts() -> Iterator[xr.DataTree]:
         nonlocal date
-        for rows in windows(replace(planned, survey=planned.survey_for(survey)).source(), memory_GiB):
+        for rows in windows(source, memory_GiB):
             found = apply_to(stored, survey, planned, tolerant=True, rows=rows, date=date)
             date = date_of(found) if date is None and RATE in stored else date
             block = survey_block(found)
@@ -175,7 +190,7 @@ def apply_long(
 
     with atomic_path(target) as temporary:
         _appended(temporary, None, parts(), made_by, flags)
-    return Applied(target, fit_in_words(combined(blocks)))
+    return Applied(target, fit_in_words(combined(blocks)), notes=too_little(source, memory_GiB))
 
 
 def _require_windows(planned: Plan) -> None:
@@ -192,10 +207,10 @@ def _require_windows(planned: Plan) -> None:
             f"{planned.file}: {name} the whole survey at once; with --memory calibrate with {', '.join(able)}"
         )
     if "total_field" not in rest[0].declares.needs:
-        raise UsageError(
-            f"{planned.file}: {rest[0].name} without a measured total field (total_field: constant and the like) needs "
-            "the whole survey at once; leave --memory away"
-        )
+        how = "without a measured total field (total_field: constant and the like)"
+        if "reference/world_field" in rest[0].declares.needs:
+            how = "with a vector reference"
+        raise UsageError(f"{planned.file}: {rest[0].name} {how} needs the whole survey at once; leave --memory away")
     for stage in rest[1:]:
         if any(p.startswith("calibration/matrix") for p in stage.declares.gives):
             raise UsageError(

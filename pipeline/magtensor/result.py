@@ -141,7 +141,8 @@ def open_result(path: Path) -> Survey:
     from magtensor.survey.hdf5 import why_unreadable
 
     try:
-        with xr.open_datatree(path, engine="h5netcdf", decode_times=False) as opened:
+        # a file that is no result may have dimensions without a name
+        with xr.open_datatree(path, engine="h5netcdf", decode_times=False, phony_dims="access") as opened:
             tree = opened.load()
     except FileNotFoundError as error:
         raise DataError("no such file", where=str(path)) from error

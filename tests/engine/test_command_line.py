@@ -9,6 +9,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import h5py
+import numpy as np
 import pytest
 
 from magtensor import __version__
@@ -121,6 +123,20 @@ def test_a_reader_that_closes_early_is_no_error():
     done = subprocess.run(["bash", "-c", command], capture_output=True, text=True)
     assert "Traceback" not in done.stderr
     assert "BrokenPipe" not in done.stderr
+    assert done.stdout == "{141\n", "status 1 would be a bug"
+
+
+def test_a_survey_in_place_of_a_calibration_is_one_message(tmp_path):
+    with h5py.File(tmp_path / "survey.h5", "w") as file:
+        file["b_raw"] = np.zeros((4, 2, 3))  # without named dimensions
+    done = magtensor("apply", tmp_path / "survey.h5", tmp_path / "survey.h5")
+    assert done.returncode == 3 and done.stderr.startswith("error: ") and "Warning" not in done.stderr
+
+
+def test_a_study_tells_what_it_does_without_doing_it():
+    study = Path(__file__).parents[2] / "studies" / "common_rotation.py"
+    done = subprocess.run([sys.executable, str(study), "--help"], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0 and done.stdout.startswith("usage: ")
 
 
 def cpu_seconds(*arguments: str) -> float:

@@ -147,6 +147,7 @@ def test_what_needs_the_whole_survey_at_once(tmp_path: Path) -> None:
     recipe = tmp_path / "r.yaml"
     for options, said in (
         ("{total_field: constant}", "total_field: constant and the like) needs the whole survey"),
+        ("{vector_reference: true}", "calibrate_joint with a vector reference needs the whole survey"),
         ("{error_models: [temperature_offset]}", "error_models: [temperature_offset] needs the whole survey"),
     ):
         recipe.write_text(f"title: t\nsurvey: a.h5\nstages: [load, detrend_diurnal, calibrate_joint: {options}]\n")
@@ -288,6 +289,7 @@ def test_mistakes(tmp_path: Path, options: str, further: str, status: int, said:
         ("{offset_of: mean}", ", with: b.h5", ""),
         ("{error_models: [temperature_offset]}", ", with: b.h5", "error_models are fitted to one survey"),
         ("{error_models: [temperature_offset]}", "", ""),
+        ("{total_field: constant}", ", with: b.h5", ""),
     ],
 )
 def test_what_further_surveys_contradict_is_found_without_data(
@@ -299,6 +301,7 @@ def test_what_further_surveys_contradict_is_found_without_data(
     assert status_of(["validate", str(recipe)]) == (2 if said else 0)
     told = capsys.readouterr().err
     assert (f"{recipe}:4" in told and said in told) if said else not told
+    assert "no stage here fits several surveys" not in told
 
 
 def test_further_surveys_of_a_stage_that_has_no_use_for_them(tmp_path: Path) -> None:

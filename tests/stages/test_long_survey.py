@@ -103,7 +103,8 @@ def test_a_run_in_windows_gives_what_the_whole_gives(folder: Path) -> None:
 
 
 def test_a_result_made_in_windows_is_made_again_in_windows(folder: Path) -> None:
-    magtensor("run", folder / "recipe.yaml", "--input", folder / "a.h5", "--output", folder / "first", "--memory", 0.1)
+    first = ("run", folder / "recipe.yaml", "--input", folder / "a.h5", "--output", folder / "first")
+    assert "--memory 0.1 cannot be kept to" in magtensor(*first, "--memory", 0.1)
     told = magtensor("run", folder / "first" / "result.nc", "--output", folder / "again")
     assert "reproduced bit for bit" in told
 
@@ -115,6 +116,7 @@ def test_apply_in_windows_gives_the_same_bits(folder: Path) -> None:
         for name, more in (("one.nc", ()), ("many.nc", ("--memory", 0.1)))
     ]
     assert told[0].splitlines()[-1] == told[1].splitlines()[-1]
+    assert ["--memory 0.1 cannot be kept to" in words for words in told] == [False, True]
     one, many = (opened(folder / name) for name in ("one.nc", "many.nc"))
     assert one["provenance"].attrs["content_sha256"] == many["provenance"].attrs["content_sha256"]
     np.testing.assert_array_equal(one["calibrated/tensor"], many["calibrated/tensor"])

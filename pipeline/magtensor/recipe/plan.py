@@ -170,8 +170,9 @@ class _Planner:
         self.several = survey is not None and bool(survey.with_)
         stages = self.stages()
         self.check_flow(stages)
-        if self.several and not any(s.component.several for s in stages.values()):
-            able = sorted(c.name for c in self.registry.components.values() if c.several)
+        able = sorted(c.name for c in self.registry.components.values() if c.several)
+        # by name: a stage whose options are refused is not planned, but it is there
+        if self.several and not {item_name(item) for item in value.get("stages") or []} & set(able):
             what = f"no stage here fits several surveys together; {', '.join(able)} does"
             self.problems.add(("survey", "with"), what)
         self.problems.raise_if_any()
