@@ -14,7 +14,7 @@ from magtensor.calibrated import B, contrasts, stored
 from magtensor.calibration.noise import noise_std
 from magtensor.calibration.types import Array, ArrayCalibration
 from magtensor.errors import DataError, NotEnoughData
-from magtensor.frame.attitude import Attitude, attitude, require_consistent
+from magtensor.frame.attitude import Attitude, attitude, mirrored_axis, require_consistent, require_unmirrored
 from magtensor.frame.calibration_errors import CalibrationErrors, errors_of
 from magtensor.frame.earlier import earlier
 from magtensor.frame.estimate import WORST, CommonRotation, carried, common_rotation, in_words
@@ -25,6 +25,11 @@ from magtensor.frame.turning import turning
 from magtensor.survey.model import AXES, Survey, Variable
 
 PLATFORM = "platform"  # how the name of a frame begins that is tied to the platform
+MIRROR = (
+    "half a turn about {axis} was taken, as of sensors mounted upside down; if axis {axis} of all sensors is inverted "
+    "instead, field and tensor have the other sign, which only the direction of the field in the world "
+    "(reference/world_field) would tell"
+)
 GAUGE = "one rotation"  # how the words begin that name the common rotation as unobservable
 _OF_A_FRAME = ("units", "frame", "unobservable", "diagnostics", "long_name", "common_rotation")
 SIGNIFICANT = 0.01  # chance that a rotation which is none passes for one
@@ -81,14 +86,21 @@ def tie(
     read: list[Source] = [earlier(errors)] if tied(calibration) else []
     for name in sources:
         read += _read(name, survey, calibration, errors, declared)
+    attitudes = [source for source in read if isinstance(source, Attitude)]
+    for source in attitudes:
+        require_unmirrored(source)
     found = common_rotation(read, errors, worst=worst)
-    for source in read:
-        if isinstance(source, Attitude):
-            require_consistent(source, found.rotation)
+    for source in attitudes:
+        require_consistent(source, found.rotation)
     frame = f"{PLATFORM} ({in_short(found)})"
     turned = carried(calibration, errors, found, frame)
-    left = tuple(w for w in turned.unobservable if not w.startswith(GAUGE))
-    return Tied(replace(turned, unobservable=left), found, told(found))
+    left = [w for w in turned.unobservable if not w.startswith(GAUGE)]
+    words = told(found)
+    axis = mirrored_axis(found.rotation)
+    if axis is not None and not any(source.world is not None for source in attitudes):
+        left.append(MIRROR.format(axis=axis))
+        words += f"; {left[-1]}"
+    return Tied(replace(turned, unobservable=tuple(left)), found, words)
 
 
 def refined(survey: Survey, calibration: ArrayCalibration, worst: float) -> tuple[Tied, bool]:

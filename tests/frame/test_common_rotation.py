@@ -10,9 +10,10 @@ from platforms import EARTH, Platform, level, passes, random_tensors
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
+from magtensor.calibration.joint import calibrated, fit_joint
 from magtensor.calibration.types import ArrayCalibration
 from magtensor.errors import DataError, NotEnoughData
-from magtensor.frame.attitude import attitude, require_consistent
+from magtensor.frame.attitude import attitude, mirrored_axis, require_consistent, require_unmirrored
 from magtensor.frame.calibration_errors import CalibrationErrors, errors_of
 from magtensor.frame.earlier import earlier
 from magtensor.frame.estimate import CommonRotation, carried, common_rotation
@@ -334,3 +335,31 @@ def test_slow_errors_of_the_attitude_widen_the_standard_deviation():
         w, covariance = turn_left(p, new)
         total += w @ np.linalg.solve(covariance, w)
     assert total < chi2.ppf(0.999, 3 * runs)
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_an_array_that_is_mirrored_as_a_whole_is_told(axis):
+    """With the world's field no rotation explains it; without, half a turn does, and every sign is wrong."""
+    rng = np.random.default_rng(11 + axis)
+    p = Platform(rng, common_deg=3.0)
+    attitudes = Rotation.random(200, random_state=rng).as_matrix()
+    raw = p.uniform(attitudes)
+    raw[:, :, axis] *= -1.0
+    fit = fit_joint(raw, np.full(len(raw), np.linalg.norm(EARTH)))
+    cal = calibrated(fit)
+    b = cal.apply(raw)
+    with pytest.raises(DataError, match=f"axis {'xyz'[axis]} of every sensor is inverted"):
+        require_unmirrored(attitude(b, attitudes, errors_of(cal), EARTH))
+    found, turned = solved([attitude(b, attitudes, errors_of(cal))], cal)
+    assert mirrored_axis(found.rotation) == "xyz"[axis]
+    seen = turned.apply(raw).mean(axis=1)
+    np.testing.assert_allclose(seen, -np.einsum("nij,i->nj", attitudes, EARTH), atol=100.0)
+
+
+def test_an_array_that_is_not_mirrored_is_not_refused():
+    rng = np.random.default_rng(14)
+    p = Platform(rng, common_deg=170.0)
+    cal = p.calibration(200)
+    (source,) = by_attitude_and_world(p, cal, rng)
+    require_unmirrored(source)
+    assert mirrored_axis(Rotation.from_rotvec([0.0, np.radians(150.0), 0.0]).as_matrix()) is None

@@ -11,6 +11,7 @@ from functools import cached_property
 
 import numpy as np
 
+from magtensor.calibration.rotation import angle_between
 from magtensor.calibration.types import Array
 from magtensor.errors import DataError, NotEnoughData
 
@@ -18,6 +19,7 @@ from .calibration_errors import CalibrationErrors, directions
 from .sources import TURNS, TWICE, Slope, edges_of, excess
 
 LEAST_SAMPLES = 10
+HALF_TURN = float(np.radians(20.0))  # rad; sensors are seldom mounted worse than this to their platform
 WORST_MISFIT = float(np.radians(10.0))  # rad rms; an attitude that errs more is not that of these sensors
 
 
@@ -131,6 +133,43 @@ def attitude(b: Array, to_world: Array, errors: CalibrationErrors, world: Array 
         errors.of_mean @ (rows.T @ direction),
         np.einsum("ijq,raq->rija", np.einsum("nij,nq->ijq", to_world, rows), errors.of_mean),
     )
+
+
+def require_unmirrored(source: Attitude) -> None:
+    """Refuse a field that follows a known world field as a mirror of it, which no rotation does.
+
+    Raises
+    ------
+    DataError: an odd number of axes is inverted in all sensors.
+    """
+    if source.world is None:
+        return
+    u, s, vt = np.linalg.svd(np.einsum("i,ija->ja", source.world, source._total))
+    nearest = np.asarray(u @ vt)
+    count = float(source.counts.sum())
+    left, proper = (float(np.trace(source.square)) + count - 2 * float(s @ [1, 1, sign]) for sign in (1, -1))
+    if np.linalg.det(nearest) > 0 or left > count * WORST_MISFIT**2 or proper <= count * WORST_MISFIT**2:
+        return
+    axis = mirrored_axis(-nearest)
+    which = "one axis or all three" if axis is None else f"axis {axis}"
+    raise DataError(
+        f"seen from the world the field is mirrored: {which} of every sensor is inverted",
+        where="attitude",
+        hint="correct the sign when loading the survey (`columns`, or the instrument's axes)",
+    )
+
+
+def mirrored_axis(rotation: Array) -> str | None:
+    """The axis about which a rotation (3, 3) is half a turn, to within `HALF_TURN`; None where it is not of an axis.
+
+    Half a turn about x and the inversion of all signs are together the mirror that inverts x.
+    """
+    for k, name in enumerate("xyz"):
+        half = -np.eye(3)
+        half[k, k] = 1.0
+        if angle_between(rotation, half) < HALF_TURN:
+            return name
+    return None
 
 
 def require_consistent(source: Attitude, rotation: Array) -> None:
