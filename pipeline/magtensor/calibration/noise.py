@@ -7,6 +7,8 @@ import numpy as np
 from magtensor.calibration.types import Array
 
 MAD_TO_SIGMA = 1.482602218505602  # for a normal distribution
+MAD_EFFICIENCY = 0.37  # of the median absolute deviation, beside the plain one, in normal noise
+SERIAL = 35.0 / 18.0  # second differences overlap: 1 + 2 (2/3)^2 + 2 (1/6)^2, the sum of their squared correlations
 LEAST_SHARE = 0.02  # of the noise variance of two sensors, that the quieter one is believed to have
 
 
@@ -23,7 +25,9 @@ def noise_std(b: Array, total_field: Array | None = None) -> Array:
             three axes are taken as equal. For two sensors it tells whose the noise of their only contrast is.
 
     Returns:
-        (S, 3) nT; NaN where fewer than four samples, or nothing to compare with, leave it open.
+        (S, 3) nT; NaN where fewer than four samples, or nothing to compare with, leave it open. Of three sensors or
+        more the axes differ as far as the samples show that they do: what chance makes of a few postures is drawn to
+        the mean of each sensor, and the sensors to that of the array.
     """
     n, sensors, _ = b.shape
     if n < 4 or (sensors == 1 and total_field is None):
@@ -41,7 +45,19 @@ def noise_std(b: Array, total_field: Array | None = None) -> Array:
     total = variance.sum(axis=0) / (1.0 - 1.0 / sensors)
     own = (variance - total / sensors**2) / (1.0 - 2.0 / sensors)
     # a sensor much quieter than its neighbours may come out below zero by chance
-    return np.sqrt(np.maximum(own, 0.01 * total / sensors))
+    own = np.maximum(own, 0.01 * total / sensors)
+    known = MAD_EFFICIENCY * (n - 2) / SERIAL * (1.0 - 2.0 / sensors) ** 2 / (1.0 - 1.0 / sensors) ** 2
+    of_sensor = _drawn(own.mean(axis=1, keepdims=True), own.mean(), 3.0 * known)
+    return np.sqrt(_drawn(own, of_sensor, known))
+
+
+def _drawn(variance: Array, target: Array | float, freedom: float) -> Array:
+    """Variances, each known from so many independent values, drawn to a target as far as they scatter by chance about
+    it: the weight of positive-part empirical Bayes (Efron and Morris 1973)."""
+    chance = 2.0 / freedom
+    beyond = max(float(np.mean((variance / target - 1.0) ** 2)) - chance, 0.0)
+    out: Array = target + beyond / (beyond + chance) * (variance - target)
+    return out
 
 
 def shares_of_two(b: Array, total_field: Array) -> Array:

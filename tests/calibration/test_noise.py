@@ -1,4 +1,4 @@
-"""Two sensors share one residual; the total field tells whose the noise is."""
+"""The noise of the sensors: two share one residual, and of a few postures chance makes differences."""
 
 from __future__ import annotations
 
@@ -56,3 +56,18 @@ def test_a_strong_effect_is_no_lack_of_attitudes_until_the_model_is_complete() -
     planar = raw * np.array([1.0, 1.0, 0.0]) + np.array([0.0, 0.0, 1_000.0])
     with pytest.raises(NotEnoughData):
         fit_joint(planar, total_field, complete=False)
+
+
+@pytest.mark.parametrize("sensors", [3, 4, 8])
+def test_the_noise_of_a_few_postures_is_not_what_chance_makes_of_an_axis(sensors: int) -> None:
+    """Equal axes come out equal within a third; the mean is right."""
+    rng = np.random.default_rng(sensors)
+    found = np.stack([noise_std(rng.standard_normal((40, sensors, 3))) for _ in range(40)])
+    assert found.min() > 0.65 and found.max() < 1.5
+    assert np.sqrt(np.mean(found**2)) == pytest.approx(1.0, abs=0.08)
+
+
+def test_axes_that_differ_are_told_apart_where_the_samples_show_it() -> None:
+    rng = np.random.default_rng(2)
+    true = np.exp(0.5 * rng.standard_normal((4, 3)))
+    np.testing.assert_allclose(noise_std(true * rng.standard_normal((20_000, 4, 3))), true, rtol=0.15)
