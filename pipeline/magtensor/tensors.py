@@ -14,10 +14,11 @@ from magtensor.survey.model import AXES, Survey, Variable
 from magtensor.tensor.assembly import Assembly, unconstrained_assembly
 from magtensor.tensor.elements import FIVE_OF_NINE, NINE_OF_FIVE, closure, five, full
 from magtensor.tensor.invariants import Invariants, invariants, invariants_std
-from magtensor.tensor.uncertainty import TakenOff, component_covariance, tensor_std
+from magtensor.tensor.uncertainty import TakenOff, component_covariance, mean_field_std, tensor_std
 
 FIVE = ("xx", "xy", "xz", "yy", "yz")
 TENSOR = ("time", "row", "column")
+NOISE_AND_CALIBRATION = "noise and calibration"  # what the standard deviations hold
 INVARIANT_UNITS = Invariants("nT2/m2", "nT3/m3", "nT/m", "nT/m")  # type: ignore[arg-type]  # names, not arrays
 _CHUNK = 65536  # samples whose (5, 5) covariances are held at a time
 
@@ -104,12 +105,17 @@ def assembled(
             nine = np.einsum("ka,nab,kb->nk", NINE_OF_FIVE, own, NINE_OF_FIVE).reshape(-1, 3, 3)
             std[part] = np.sqrt(std[part] ** 2 + nine)
         deviations[part] = np.stack(invariants_std(tensor[part], each), axis=1)
-    mean_field = assembly.field(b)
+    field_std = mean_field_std(assembly, b, noise_covariance=covariance, calibration=calibration, taken_off=taken_off)
+    of_field = {"units": "nT", "long_name": "at the centre"}
+    of_std = {"units": "nT", "long_name": NOISE_AND_CALIBRATION}
     return (
         tensor_variables(tensor, std)
         | invariant_variables(values, deviations)
         | closure_variables(b, position)
-        | {"calibrated/mean_field": (("time", "axis"), mean_field, {"units": "nT", "long_name": "at the centre"})}
+        | {
+            "calibrated/mean_field": (("time", "axis"), assembly.field(b), of_field),
+            "calibrated/mean_field_std": (("time", "axis"), field_std, of_std),
+        }
     )
 
 
@@ -200,7 +206,7 @@ def tensor_variables(tensor: Array, std: Array | None = None) -> dict[str, Varia
         "calibrated/tensor": (TENSOR, tensor, {"units": "nT/m", "long_name": "gradient tensor, dB_row/dx_column"}),
     }
     if std is not None:
-        attributes = {"units": "nT/m", "long_name": "noise and calibration"}
+        attributes = {"units": "nT/m", "long_name": NOISE_AND_CALIBRATION}
         given["calibrated/tensor_std"] = (TENSOR, std, attributes)
     return given
 

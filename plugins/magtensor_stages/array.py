@@ -70,8 +70,9 @@ CALIBRATED = (
     "calibrated/b", "calibration/rotation", "calibration/matrix", "calibration/offset", "calibration/covariance",
 )  # fmt: skip
 TENSOR = (
-    "calibrated/tensor", "calibrated/tensor_std", "calibrated/mean_field", "calibrated/invariants",
-    "calibrated/invariants_std", "calibration/tensor_gain", "calibration/field_gain", "calibration/position",
+    "calibrated/tensor", "calibrated/tensor_std", "calibrated/mean_field", "calibrated/mean_field_std",
+    "calibrated/invariants", "calibrated/invariants_std", "calibration/tensor_gain", "calibration/field_gain",
+    "calibration/position",
 )  # fmt: skip
 BESIDE_TENSOR = (
     "residual/closure", "residual/identity", "calibrated/row", "calibrated/column", "calibrated/invariant",

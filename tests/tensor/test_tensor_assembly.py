@@ -10,6 +10,7 @@ from magtensor.tensor.elements import closure, five, full, separate
 from magtensor.tensor.geometry import STANDARD_GEOMETRIES, standard_geometry
 from magtensor.tensor.uncertainty import (
     component_covariance,
+    mean_field_std,
     noise_covariance_of_components,
     noise_tensor_std,
     tensor_std,
@@ -292,13 +293,11 @@ def test_calibration_covariance_agrees_with_monte_carlo_and_adds_to_noise(name):
     b = np.repeat(50000 * directions[:, None] / np.linalg.norm(directions, axis=1)[:, None, None], sensors, axis=1)
     raw = np.einsum("sij,nsj->nsi", np.linalg.inv(calibration.matrix), b) + calibration.offset
     draws = rng.multivariate_normal(np.zeros(12 * sensors), calibration.covariance, 4000).reshape(-1, sensors, 12)
-    sampled = np.stack(
-        [
-            five(assembly.apply(np.einsum("sij,nsj->nsi", calibration.matrix + p[:, :9].reshape(-1, 3, 3),
-                                          raw - calibration.offset - p[:, 9:])))
-            for p in draws
-        ]
-    )  # fmt: skip
+    fields = [
+        np.einsum("sij,nsj->nsi", calibration.matrix + p[:, :9].reshape(-1, 3, 3), raw - calibration.offset - p[:, 9:])
+        for p in draws
+    ]
+    sampled = np.stack([five(assembly.apply(field)) for field in fields])
     predicted = component_covariance(assembly, b, calibration=calibration)
     for n in range(5):
         spread = np.sqrt(np.outer(np.diag(predicted[n]), np.diag(predicted[n])))
@@ -310,6 +309,12 @@ def test_calibration_covariance_agrees_with_monte_carlo_and_adds_to_noise(name):
     rows, columns = [0, 0, 0, 1, 1], [0, 1, 2, 1, 2]
     np.testing.assert_allclose(std[:, rows, columns], np.sqrt(np.einsum("naa->na", both)), rtol=1e-8)
     np.testing.assert_allclose(std, std.transpose(0, 2, 1))
+    of_field = mean_field_std(assembly, b, calibration=calibration)
+    np.testing.assert_allclose(np.std([assembly.field(field) for field in fields], axis=0), of_field, rtol=0.06)
+    noisy = mean_field_std(assembly, b, noise_covariance=noise, calibration=calibration)
+    np.testing.assert_allclose(
+        noisy**2 - of_field**2, 0.2 * np.sum(assembly.field_gain**2, axis=(1, 2)) * np.ones((5, 1))
+    )
     plain = tensor_std(chi2017_cross(position, None), b, calibration=calibration) if name == "cross" else None
     if plain is not None:
         assert not np.allclose(plain[:, 0, 1], plain[:, 1, 0])  # Bxy and Byx come from different sensors

@@ -118,6 +118,31 @@ def tensor_std(
     return out
 
 
+def mean_field_std(
+    assembly: Assembly,
+    b: Array,
+    *,
+    noise_covariance: Array | None = None,
+    calibration: ArrayCalibration | None = None,
+    taken_off: TakenOff | None = None,
+) -> Array:
+    """Standard deviation (N, 3) in nT of the field at the array's centre, noise and calibration added.
+
+    Parameters as in `component_covariance`. A rotation of the frame that the covariance does not hold is not in it.
+    """
+    fields, rows = assembly.checked_fields(b), assembly.field_gain.reshape(3, -1)
+    variance = np.zeros((len(fields), 3))
+    if noise_covariance is not None:
+        noise = checked_noise_covariance(noise_covariance, assembly.field_gain.shape[1])
+        variance += np.einsum("ap,pq,aq->a", rows, noise, rows)
+    if calibration is not None:
+        each = np.arange(3)
+        for part, values in _calibration_terms(rows, (each, each), fields, calibration, taken_off):
+            variance[part] += np.maximum(values, 0)
+    out: Array = np.sqrt(variance)
+    return out
+
+
 def _nine_rows(assembly: Assembly) -> Array:
     out: Array = assembly.gain.reshape(9, -1)
     return out
