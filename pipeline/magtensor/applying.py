@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -115,6 +115,7 @@ def apply_to(
     uniform: bool = False,
     judge: bool = True,
     date: datetime | None = None,
+    scatter: float | None = None,
 ) -> Survey:
     """Another survey, loaded as the recipe loads and corrected with a calibration; the options as in
     `apply_and_refine`."""
@@ -128,6 +129,7 @@ def apply_to(
         uniform=uniform,
         judge=judge,
         date=date,
+        scatter=scatter,
     )[0]
 
 
@@ -142,6 +144,7 @@ def apply_and_refine(
     uniform: bool = False,
     judge: bool = True,
     date: datetime | None = None,
+    scatter: float | None = None,
 ) -> tuple[Survey, Tied | None]:
     """Another survey, loaded as the recipe loads and corrected with a calibration.
 
@@ -152,15 +155,18 @@ def apply_and_refine(
         judge: flag the samples that stand out alone (`standing_out`); the attribute `not_taken_off` of `calibrated/b`
             names effects that cannot be taken off this survey.
         date: that a calibration which changes with time is brought to; the survey's when None.
+        scatter: nT, of the survey's offsets about those of the calibration (`offsets_apart`); found when None.
 
     Returns:
         The survey, and the calibration in its new frame: None where no turn was asked for or is significant. The
         attribute `rotation_refined` of `calibrated/b` says what was done.
     """
     from magtensor.calibrated import corrected, require_positions, require_sensors, restored
+    from magtensor.calibration.surveys.corrections import with_scatter
     from magtensor.dated import at_date_of
     from magtensor.effect_errors import taken_off
     from magtensor.loop.stored import cleaned, left_in, on_its_clock, stored_effects
+    from magtensor.offsets_apart import scatter_for, without_scatter
     from magtensor.platform_frame import as_fitted, with_refined_rotation
     from magtensor.standing_out import flagged
     from magtensor.tensor.elements import five
@@ -174,16 +180,20 @@ def apply_and_refine(
         if "calibration/position" in calibration:
             require_positions(survey, calibration.values("calibration/position"), str(path))
         fitted, dated = at_date_of(survey, calibration, restored(calibration), date)
+        apart = scatter_for(survey, calibration) if scatter is None else scatter
+        fitted = with_scatter(fitted, apart)
         adopted, theta, means = stored_effects(calibration, planned.registry)
         adopted = on_its_clock(adopted, calibration, survey)
         before, survey = survey, cleaned(survey, as_fitted(calibration, fitted), adopted, theta, means)
         if judge:
             known = calibration.values("calibration/noise_std") if "calibration/noise_std" in calibration else None
             survey = flagged(survey, fitted, known, uniform=uniform)
-        survey = survey.merged(_named(corrected(fitted, survey, left_in(survey, adopted)), calibration, dated))
+        survey = survey.merged(_named(corrected(fitted, survey, left_in(survey, adopted)), calibration, dated, apart))
         if refine_rotation:
             survey, turned = with_refined_rotation(survey, calibration, fitted)
-            fitted = turned.calibration if turned is not None else fitted
+            if turned is not None:  # as it is kept, it holds the scatter beside the covariance
+                fitted = turned.calibration
+                turned = replace(turned, calibration=without_scatter(fitted, apart))
         if "calibration/tensor_gain" in calibration:
             b, noise = survey.values("calibrated/b"), calibration.values("calibration/noise_std")
             position = calibration.values("calibration/position")
@@ -206,10 +216,13 @@ def apply_and_refine(
     return survey, turned
 
 
-def _named(given: dict[str, Variable], calibration: Survey, dated: str) -> dict[str, Variable]:
-    """The variables of a calibrated survey, with the words that say whose offsets were taken off, and the date that the
-    calibration was brought to."""
-    words = {"offset_of": calibration["calibration/matrix"].attrs.get("offset_of"), "calibration_date": dated}
+def _named(given: dict[str, Variable], calibration: Survey, dated: str, scatter: float) -> dict[str, Variable]:
+    """The variables of a calibrated survey, with the words that say whose offsets were taken off, by how many nT they
+    scatter about this survey's, and the date that the calibration was brought to."""
+    from magtensor.offsets_apart import for_another
+
+    whose = for_another(str(calibration["calibration/matrix"].attrs.get("offset_of", "")), scatter)
+    words = {"offset_of": whose, "calibration_date": dated, "offset_scatter_nT": scatter}
     dims, values, attributes = given["calibrated/b"]
     return given | {"calibrated/b": (dims, values, dict(attributes) | {k: v for k, v in words.items() if v})}
 

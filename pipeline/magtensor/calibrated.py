@@ -59,6 +59,14 @@ def left_open(survey: Survey) -> tuple[str, ...]:
     return (*json.loads(str(attributes.get("unobservable", "[]"))), *reason)
 
 
+def told_of_disagreement(survey: Survey) -> tuple[str, ...]:
+    """What a fit of one C to several surveys says of how they disagree about it; nothing where they agree."""
+    if "calibration/matrix" not in survey:
+        return ()
+    words = json.loads(str(survey["calibration/matrix"].attrs.get("diagnostics", "{}"))).get("disagreement")
+    return (str(words),) if words else ()
+
+
 def restored(survey: Survey) -> ArrayCalibration:
     """The calibration that `stored` put into a survey.
 

@@ -175,14 +175,16 @@ def apply_long(
     blocks: list[tuple[int, dict[str, Any] | None]] = []
     flags: list[Flag] = []
     date: datetime | None = None
+    scatter: float | None = None  # the first window tells whose survey it is
 
     source = replace(planned, survey=planned.survey_for(survey)).source()
 
     def parts() -> Iterator[xr.DataTree]:
-        nonlocal date
+        nonlocal date, scatter
         for rows in windows(source, memory_GiB):
-            found = apply_to(stored, survey, planned, tolerant=True, rows=rows, date=date)
+            found = apply_to(stored, survey, planned, tolerant=True, rows=rows, date=date, scatter=scatter)
             date = date_of(found) if date is None and RATE in stored else date
+            scatter = float(found["calibrated/b"].attrs.get("offset_scatter_nT", 0.0))
             block = survey_block(found)
             blocks.append((int(block["samples"]) if block else 0, block))
             flags.extend(found.flags)

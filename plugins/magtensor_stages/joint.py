@@ -335,8 +335,10 @@ def _from_surveys(
     mean: bool,
 ) -> tuple[ArrayCalibration, dict[str, Any], np.ndarray]:
     """The calibration, what else is told of it, and the samples (N,) of this survey that no noise explains."""
+    from magtensor.calibration.surveys.agreeing import disagreement_in_words
     from magtensor.calibration.surveys.corrections import calibrated_surveys
     from magtensor.calibration.surveys.fit import fit_surveys
+    from magtensor.offsets_apart import SCATTER, scatter_variable
 
     reference_noise, attitude_std_deg, robust, worst_error = how
     names, uses, samples = joint_surveys.gathered(joint_surveys.named_surveys(survey), field)
@@ -360,6 +362,10 @@ def _from_surveys(
     else:
         calibration = joint_surveys.with_declared_size(survey, field, calibration)
     extra = joint_surveys.survey_variables(names, fit, found, survey.sensors, factor)
+    if len(found.offset) > 1 and not mean:
+        extra[SCATTER] = scatter_variable(survey, found.scatter)
+    if words := disagreement_in_words(fit, samples, names):
+        calibration.diagnostics["disagreement"] = words
     if words := joint_surveys.offset_words(names, found.offset, mean):
         extra["offset_of"] = words
     return calibration, extra, joint_surveys.doubted_in(survey, uses[0], fit.keep)

@@ -29,9 +29,10 @@ def changing_with_date(
         DataError: a survey's clock does not tell its date, or they all have one.
     """
     from magtensor.calibration.surveys.changing import fit_changing
-    from magtensor.calibration.surveys.dated import dated, survey_covariance
+    from magtensor.calibration.surveys.dated import dated, offset_scatter, survey_covariance
     from magtensor.calibration.surveys.straight import in_words, straight
     from magtensor.dated import change_variables, date_of, span_facts, years_between
+    from magtensor.offsets_apart import SCATTER, scatter_variable
 
     reference_noise, attitude_std_deg, robust, worst_error = how
     surveys = joint_surveys.named_surveys(survey)
@@ -63,5 +64,7 @@ def changing_with_date(
         extra |= joint_surveys.offset_variables(
             names, survey.sensors, own, survey_covariance(fit, line, 0), calibration
         )
+        if not mean:
+            extra[SCATTER] = scatter_variable(survey, offset_scatter(fit, line))
         extra["offset_of"] = joint_surveys.offset_words(names, own, mean)
     return calibration, extra, joint_surveys.doubted_in(survey, uses[0], fit.alike.keep)

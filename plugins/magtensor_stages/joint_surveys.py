@@ -10,6 +10,7 @@ import numpy as np
 
 from magtensor import DataError, NotEnoughData
 from magtensor.calibrated import require_sensors
+from magtensor.offsets_apart import HELD, NOT_HELD
 
 if TYPE_CHECKING:
     from magtensor.calibration.surveys.corrections import SurveysCalibration
@@ -159,8 +160,8 @@ def offset_words(names: Sequence[str], offset: np.ndarray, mean: bool) -> str:
     apart = float(np.sqrt(np.mean(np.var(offset, axis=0, ddof=1))))
     scatter = f"they scatter by {apart:.3g} nT between the {count} surveys"
     if mean:
-        return f"the mean of {', '.join(names)}; {scatter}, which their standard deviations hold"
-    return f"those of {names[0]}; {scatter}, which their standard deviations do not hold"
+        return f"the mean of {', '.join(names)}; {scatter}, {HELD}"
+    return f"those of {names[0]}; {scatter}, {NOT_HELD}"
 
 
 def survey_variables(

@@ -46,6 +46,7 @@ def test_a_later_survey_is_calibrated_for_its_date(tmp_path: Path) -> None:
     assert done.exit_code == 0, done.output
     assert "a rotation that all sensors share between surveys" in done.output
     assert "with the date: C changes by up to" in done.output
+    assert "disagree about C" not in done.output
     calibration = tmp_path / "out/calibration.nc"
     tree, matrix = matrix_of(calibration)
     assert length_error(matrix, DATES[0]) < 3e-5 < length_error(matrix, LATER)
@@ -81,6 +82,17 @@ def test_a_later_survey_is_calibrated_for_its_date(tmp_path: Path) -> None:
         np.testing.assert_array_equal(found["calibrated/b"].values, b)
     again = command("run", tmp_path / "out/result.nc", "--output", tmp_path / "again")
     assert again.exit_code == 0 and "reproduced bit for bit" in again.output, again.output
+
+
+def test_surveys_of_an_ageing_c_are_said_to_disagree_about_one(tmp_path: Path) -> None:
+    for seed, date in enumerate(DATES):
+        forward = FORWARD + 0.1 * year(date) * RATE
+        written(tmp_path / f"{'abcd'[seed]}.h5", 10 + seed, samples=400, reference=True, forward=forward, date=date)
+    done = run(tmp_path, STAGES.format("offsets: own"), further=", with: [b.h5, c.h5, d.h5]")
+    assert done.exit_code == 0, done.output
+    assert "the surveys disagree about C" in done.output and "`matrices: linear`" in done.output
+    tree, _ = matrix_of(tmp_path / "out/calibration.nc")
+    assert "disagree" in json.loads(tree["calibration/matrix"].attrs["diagnostics"])["disagreement"]
 
 
 def test_offsets_that_drift(tmp_path: Path) -> None:

@@ -31,14 +31,21 @@ class SurveysCalibration:
     def of_survey(self, number: int) -> ArrayCalibration:
         """With the offset of one survey."""
         weights = np.eye(len(self.offset))[number if len(self.offset) > 1 else 0]
-        return self._with(weights, np.zeros((0, 0)))
+        return self._with(weights, 0.0)
+
+    @property
+    def scatter(self) -> float:
+        """nT, of the offsets of a survey about those of all surveys (`scatter_of`); 0 where they share one."""
+        size = 9 * len(self.common.matrix)
+        count = len(self.offset)
+        return scatter_of(self.offset.reshape(count, -1), self.covariance[size:, size:]) if count > 1 else 0.0
 
     def of_another(self) -> ArrayCalibration:
         """With the mean offset, as the best guess for a survey that was not in the fit; the scatter of the offsets
         between the surveys is then part of their covariance."""
         count = len(self.offset)
         weights = np.full(count, 1.0 / count)
-        return self._with(weights, scatter_of(self.offset.reshape(count, -1)) if count > 1 else np.zeros((0, 0)))
+        return self._with(weights, self.scatter * np.sqrt(1 + 1 / count))
 
     def nominal(self) -> SurveysCalibration:
         """The same with nominal mean sensitivity (`common_scale`), where no total field was measured."""
@@ -48,23 +55,39 @@ class SurveysCalibration:
         jacobian[:size, :size] = nominal(self.common.matrix).jacobian
         return SurveysCalibration(common, self.offset, jacobian @ self.covariance @ jacobian.T)
 
-    def _with(self, weights: Array, scatter: Array) -> ArrayCalibration:
+    def _with(self, weights: Array, scatter: float) -> ArrayCalibration:
         sensors = len(self.common.matrix)
         pick = with_offset(sensors, weights)
-        covariance = pick @ self.covariance @ pick.T
-        if scatter.size:
-            at = np.concatenate([12 * s + 9 + np.arange(3) for s in range(sensors)])
-            covariance[np.ix_(at, at)] += scatter
         offset: Array = np.einsum("k,ksi->si", weights, self.offset)
-        return replace(self.common, offset=offset, covariance=covariance)
+        own = replace(self.common, offset=offset, covariance=pick @ self.covariance @ pick.T)
+        return with_scatter(own, scatter)
 
 
-def scatter_of(offset: Array) -> Array:
-    """(3 S, 3 S) nT^2: by how much the offsets of a further survey scatter about the mean of K surveys' (K, 3 S)."""
-    count = len(offset)
+def scatter_of(offset: Array, covariance: Array) -> float:
+    """nT: standard deviation of any one offset between surveys, from those of K surveys.
+
+    One variance for all 3 S offsets: K surveys tell no more than K - 1 directions of a covariance. With f = 3 S (K - 1)
+    degrees of freedom the offset of a further survey has Student's distribution, whose variance is f / (f - 2) times
+    the estimate. What the errors of the estimates explain is taken off.
+
+    Parameters
+    ----------
+    offset: (K, 3 S) nT, K > 1; covariance: (3 S K, 3 S K) nT^2, of the errors of their estimates, survey after survey.
+    """
+    count, values = offset.shape
+    freedom = values * (count - 1)
     away = offset - offset.mean(axis=0)
-    out: Array = away.T @ away / (count - 1) * (1 + 1 / count)
-    return out
+    centring = np.kron(np.eye(count) - 1.0 / count, np.eye(values))
+    by_error = float(np.sum(centring * covariance))
+    return float(np.sqrt(max(float(np.sum(away**2)) / (freedom - 2) - by_error / freedom, 0.0)))
+
+
+def with_scatter(calibration: ArrayCalibration, scatter: float) -> ArrayCalibration:
+    """A calibration whose offsets are uncertain by so many nT more, each by itself."""
+    covariance = calibration.covariance.copy()
+    at = np.arange(len(covariance)).reshape(-1, 12)[:, 9:].ravel()
+    covariance[at, at] += scatter**2
+    return replace(calibration, covariance=covariance)
 
 
 def frame_words(fit: SurveysFit) -> tuple[str, tuple[str, ...], dict[str, float | str]]:

@@ -149,6 +149,12 @@ def _between(fit: ChangingFit, found: Straight, forward: Array, mean_offset: boo
         out = fixing @ out @ fixing.T
     if mean_offset:
         of_o = places[:, 9:].ravel()
-        size = 9 * sensors * fit.design.matrices.shape[1]
-        out[np.ix_(of_o, of_o)] += scatter_of(fit.parameters[size:].reshape(-1, 3 * sensors))
+        out[of_o, of_o] += offset_scatter(fit, found) ** 2 * (1 + 1 / len(fit.said))
     return out
+
+
+def offset_scatter(fit: ChangingFit, found: Straight) -> float:
+    """nT: `scatter_of` the surveys' own offsets."""
+    size = 3 * len(fit.design.noise) * fit.design.matrices.shape[1]
+    offset = fit.parameters[size:].reshape(-1, len(fit.design.noise))
+    return scatter_of(offset, found.covariance[size:, size:])

@@ -130,7 +130,8 @@ def fit_surveys(
         if again.sum() < 0.5 * count:
             raise NotEnoughData(
                 "more than half of the samples disagree with any one calibration",
-                hint="look for a moving magnetic object, a dead axis or wrong units",
+                hint="look for a moving magnetic object, a dead axis or wrong units"
+                + ("; C may also change from survey to survey: `matrices: linear`" if samples.surveys > 1 else ""),
             )
         left = np.bincount(samples.survey[again], minlength=samples.surveys)
         if left.min() < LEAST_PER_SURVEY:
