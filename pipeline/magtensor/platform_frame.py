@@ -22,6 +22,7 @@ from magtensor.frame.mounting import mounting
 from magtensor.frame.sources import Source
 from magtensor.frame.symmetry import symmetry
 from magtensor.frame.turning import turning
+from magtensor.misread import require_following
 from magtensor.survey.model import AXES, Survey, Variable
 
 PLATFORM = "platform"  # how the name of a frame begins that is tied to the platform
@@ -221,6 +222,7 @@ def _read(
         to_world = np.stack([into_platform(survey.values("attitude"), axis) for axis in np.eye(3)], axis=1)
         use &= np.isfinite(to_world).all(axis=(1, 2))
         world = survey.values("reference/world_field") if "reference/world_field" in survey else None
+        require_following(survey.values("attitude")[use], b[use].mean(axis=1), world)
         return [attitude(b[use], to_world[use], errors, world)]
     if name == "axis":
         if not declared.turns:

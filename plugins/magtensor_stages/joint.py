@@ -341,8 +341,9 @@ def _from_surveys(
     from magtensor.offsets_apart import SCATTER, scatter_variable
 
     reference_noise, attitude_std_deg, robust, worst_error = how
-    names, uses, samples = joint_surveys.gathered(joint_surveys.named_surveys(survey), field)
-    with naming(survey):
+    surveys = joint_surveys.named_surveys(survey)
+    names, uses, samples = joint_surveys.gathered(surveys, field)
+    with naming(survey), joint_surveys.attitude_suspected(surveys, uses, field):
         fit = fit_surveys(
             samples,
             common_offsets=common_offsets,
@@ -355,7 +356,7 @@ def _from_surveys(
         found = calibrated_surveys(fit)
     calibration, factor = found.of_another() if mean else found.of_survey(0), 1.0
     if not field.measured:
-        aside = any(joint_surveys.has_measured_field(one) for _, one in joint_surveys.named_surveys(survey))
+        aside = any(joint_surveys.has_measured_field(one) for _, one in surveys)
         typical = float(np.mean(fit.found.sums.total_field))
         calibration, factor = _without_reference(calibration, field, typical, aside)
         found = found if field.declared is not None else found.nominal()

@@ -38,7 +38,7 @@ def changing_with_date(
     surveys = joint_surveys.named_surveys(survey)
     dates = [date_of(one) for _, one in surveys]
     names, uses, samples = joint_surveys.gathered(surveys, field)
-    with naming(survey):
+    with naming(survey), joint_surveys.attitude_suspected(surveys, uses, field):
         fit = fit_changing(
             samples,
             np.array([years_between(min(dates), date) for date in dates]),

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -125,6 +126,31 @@ def gathered(surveys: Sequence[tuple[str, Survey]], field: Field) -> tuple[list[
     if not field.measured and not field.vector:  # one number for all: a scale of its own for each would be a claim
         parts = [replace(p, total_field=np.full(len(p.raw), size)) for p in parts]
     return names, uses, joined(parts)
+
+
+@contextmanager
+def attitude_suspected(
+    surveys: Sequence[tuple[str, Survey]], uses: Sequence[np.ndarray], field: Field
+) -> Iterator[None]:
+    """Where a fit with a vector reference is refused, ask first whether the attitude (`misread`) is to blame."""
+    from magtensor.calibration.coverage import coverage_alone
+    from magtensor.misread import require_following
+
+    try:
+        yield
+    except DataError:
+        if not field.vector:
+            raise
+        for (name, one), use in zip(surveys, uses, strict=True):
+            world = np.asarray(one.values("reference/world_field"), dtype=float)
+            b = np.asarray(one.values("b_raw"), dtype=float)[use].mean(axis=1)
+            found, centre = coverage_alone(b, np.full(len(b), np.linalg.norm(world)))
+            try:
+                require_following(one.values("attitude")[use], b - centre if found.determined else b, world)
+            except DataError as error:
+                where = name if len(surveys) > 1 else error.where
+                raise DataError(error.what, where=where, hint=error.hint) from error
+        raise
 
 
 def with_declared_size(survey: Survey, field: Field, calibration: ArrayCalibration) -> ArrayCalibration:

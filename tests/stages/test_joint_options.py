@@ -292,6 +292,25 @@ def test_a_vector_reference_ties_the_frame(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    ("order", "signs", "said"),
+    [
+        ([0, 1, 2, 3], [-1, -1, -1, 1], "read as the inverse (`maps: world to platform`)"),
+        ([3, 0, 1, 2], [1, 1, 1, 1], "read as one with the scalar first (`scalar: first`)"),
+    ],
+)
+def test_an_attitude_that_is_misread_is_not_blamed_on_samples(
+    tmp_path: Path, order: list[int], signs: list[int], said: str
+) -> None:
+    written(tmp_path / "a.h5", 3, samples=600, attitude_deg=0.3)
+    with h5py.File(tmp_path / "a.h5", "r+") as file:
+        file["attitude"][...] = file["attitude"][()][:, order] * signs
+    world = f", reference: {{world_field: {{value: {WORLD.tolist()}, units: nT}}}}"
+    done = run(tmp_path, "[load, calibrate_joint: {vector_reference: true}]", further=world)
+    assert done.exit_code == 3 and "the attitude does not go with the field" in done.output, done.output
+    assert said in done.output and "disturbed samples" not in done.output
+
+
+@pytest.mark.parametrize(
     ("options", "further", "status", "said"),
     [
         ("{offset_of: mean}", "", 2, "needs further surveys"),
