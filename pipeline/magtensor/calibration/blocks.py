@@ -13,7 +13,7 @@ from itertools import pairwise
 import numpy as np
 
 from .common_field import CommonField
-from .maximum_likelihood import CHUNK, NOTHING, Along, ScalarFit, Scores, along, scores_of_blocks
+from .maximum_likelihood import CHUNK, NOTHING, Along, ScalarFit, Scores, along, products_of, scores_of_blocks
 from .types import Array
 
 BLOCKS = 128  # of a recording; of a long one three quarters as many to three halves
@@ -69,9 +69,10 @@ class Blocks:
         """Samples z (3 S, n) of consecutive blocks, the first with its number, from each edge to the next. The first
         may go on where the last one ended."""
         size = len(z)
+        one = np.vstack([z, np.ones(z.shape[1])]) if size > 3 else np.empty((0, 0))
         for own, (start, stop) in zip(scores_of_blocks(seen, total_field, edges), pairwise(edges), strict=True):
-            part = z[:, start:stop]
-            total, square = (part.sum(axis=1), part @ part.T) if size > 3 else (np.zeros(size), np.zeros((size, size)))
+            sums = products_of(one, size, start, stop) if size > 3 else np.zeros((size, size + 1))
+            square, total = sums[:, :size], sums[:, size]
             if number == self.number:
                 self.total[-1] += total
                 self.square[-1] += square

@@ -31,6 +31,10 @@ CHUNK = 8192  # samples worked on at a time: their columns stay in the processor
 PAIRS = ((1, 2), (0, 2), (0, 1))
 WEIGHTS = np.array([1.0, 1, 1, 2, 2, 2, 1, 1, 1])  # an off-diagonal element of E counts twice
 _TWICE = np.outer(WEIGHTS, WEIGHTS)
+_ELEMENTS = (np.array([0, 1, 2, 1, 0, 0]), np.array([0, 1, 2, 2, 2, 1]))  # of a symmetric matrix, as in E
+_SYMMETRIC = np.array([[0, 5, 4], [5, 1, 3], [4, 3, 2]])  # and back
+_MOMENTS = np.array([[0, 5, 4, 6], [5, 1, 3, 7], [4, 3, 2, 8], [6, 7, 8, 0]])  # of (field, 1), the last element apart
+_COLUMNS = 4096
 
 
 @dataclass(frozen=True)
@@ -106,40 +110,53 @@ class Along:
     """Samples seen along the field; arrays of columns, (3, n) or (n,).
 
     Attributes:
-        unit: u, direction of b; length: |b| nT.
-        turned: U U' u nT; own: u' U U' u nT^2, what the noise of y adds to the variance of |b|.
+        stretch: K = U U' (3, 3).
+        field: b nT; products: (6, n) nT^2, b_i b_j in order xx, yy, zz, yz, xz, xy; squared: |b|^2; length: |b| nT.
+        own: u' K u nT^2 with u the direction of b: what the noise of y adds to the variance of |b|.
         inverse_std: 1/nT, of |b| - F.
         residual: whitened.
     """
 
-    unit: Array
+    stretch: Array
+    field: Array
+    products: Array
+    squared: Array
     length: Array
-    turned: Array
     own: Array
     inverse_std: Array
     residual: Array
 
+    @property
+    def unit(self) -> Array:
+        """(3, n) u."""
+        out: Array = self.field / self.length
+        return out
+
+    @property
+    def turned(self) -> Array:
+        """(3, n) K u."""
+        out: Array = self.stretch @ self.unit
+        return out
+
 
 def along(matrix: Array, offset: Array, y: Array, total_field: Array, reference_noise: float) -> Along:
     """The whitened residual of samples y (3, n) with total field (n,) nT, and what its derivative needs."""
-    unit = matrix @ y
-    unit -= (matrix @ offset)[:, None]
-    length = _dot(unit, unit)
-    np.sqrt(length, out=length)
-    unit /= length
-    square = matrix @ matrix.T
-    turned = np.empty_like(unit)
-    for row, out in zip(square, turned, strict=True):
-        np.multiply(row[0], unit[0], out=out)
-        out += row[1] * unit[1]
-        out += row[2] * unit[2]
-    own = _dot(unit, turned)
+    stretch = matrix @ matrix.T
+    field = matrix @ y
+    field -= (matrix @ offset)[:, None]
+    products = np.empty((6, field.shape[1]))
+    np.multiply(field, field, out=products[:3])
+    for k, (i, j) in enumerate(PAIRS):
+        np.multiply(field[i], field[j], out=products[3 + k])
+    squared, own = np.array([[1.0, 1, 1, 0, 0, 0], stretch[_ELEMENTS] * WEIGHTS[:6]]) @ products
+    own /= squared
+    length = np.sqrt(squared)
     inverse_std = own + reference_noise**2
     np.sqrt(inverse_std, out=inverse_std)
     np.divide(1.0, inverse_std, out=inverse_std)
     residual = length - total_field
     residual *= inverse_std
-    return Along(unit, length, turned, own, inverse_std, residual)
+    return Along(stretch, field, products, squared, length, own, inverse_std, residual)
 
 
 def scores(seen: Along, total_field: Array) -> Scores:
@@ -148,40 +165,54 @@ def scores(seen: Along, total_field: Array) -> Scores:
 
 
 def scores_of_blocks(seen: Along, total_field: Array, edges: Sequence[int]) -> list[Scores]:
-    """The sums of samples seen along the field, total_field (n,) nT, from each edge to the next."""
-    u, h, r = seen.unit, seen.turned, seen.residual
-    m = r * seen.inverse_std
-    m2 = m * m
-    # d r^2/2 with d|b| = |b| u'E u + u'e and d(std^2)/2 = (2 h - own u)'E u + (h - own u)'e / |b|, h = U U'u
-    shrink = m2 * seen.own
-    toward = (m * seen.length + shrink) * u
-    m2 += m2
-    toward -= m2 * h
-    shrink /= seen.length
-    shrink += m
-    m2 /= 2.0 * seen.length
-    rows = np.empty((9, len(r)))
-    scaled = np.multiply(u, seen.inverse_std, out=rows[6:])
-    foot = u * total_field
-    np.multiply(scaled, foot, out=rows[:3])
-    for k, (i, j) in enumerate(PAIRS):
-        np.multiply(scaled[i], foot[j], out=rows[3 + k])
+    """The sums of samples seen along the field, total_field (n,) nT, from each edge to the next.
+
+    With s = inverse_std the residual changes by s |b| u'E u + s u'e, to first order in the noise s F u'E u + s u'e, and
+    std^2 / 2 by (2 K u - own u)'E u + (K u - own u)'e / |b|. Both are linear in s F u_i u_j and s u_i, so that all
+    sums are products of these nine rows, with each other and with six columns of weights.
+    """
+    r, s, length = seen.residual, seen.inverse_std, seen.length
+    everything = np.empty((14, len(r)))
+    rows, (foot, shape, shape_turned, shift, shift_turned) = everything[:9], everything[9:]
+    np.multiply(seen.products, total_field * s / seen.squared, out=rows[:6])
+    np.multiply(seen.field, s / length, out=rows[6:])
+    np.divide(total_field, s, out=foot)
+    spread = r * r
+    spread *= s
+    np.divide(spread, total_field, out=shape_turned)
+    np.divide(spread, length, out=shift_turned)
+    np.divide(length, total_field, out=shape)
+    shape *= r
+    shape += np.multiply(shape_turned, seen.own, out=spread)
+    np.multiply(shift_turned, seen.own, out=shift)
+    shift += r
     found = []
     for start, stop in pairwise(edges):
         part = slice(start, stop)
-        t, v, foot_, own = toward[:, part], u[:, part], foot[:, part], rows[:, part]
-        change = [float(t[i] @ v[i]) for i in range(3)]
-        change += [float(t[i] @ v[j] + t[j] @ v[i]) for i, j in PAIRS]
-        shift = v @ shrink[part] - h[:, part] @ m2[part]
-        moments = np.empty((4, 4))
-        for i in range(3):
-            for j in range(i + 1):
-                moments[i, j] = moments[j, i] = foot_[i] @ foot_[j]
-            moments[i, 3] = moments[3, i] = foot_[i].sum()
+        sums = products_of(everything, 9, start, stop)
+        by_foot, by_shape, by_shape_turned, by_shift, by_shift_turned = sums[:, 9:].T
+        turned = seen.stretch @ by_shape_turned[_SYMMETRIC]
+        gradient = by_shape * WEIGHTS
+        gradient[:6] -= (turned + turned.T)[_ELEMENTS] * WEIGHTS[:6]
+        gradient[6:] = by_shift[6:] - seen.stretch @ by_shift_turned[6:]
+        moments = by_foot[_MOMENTS]
         moments[3, 3] = stop - start
         cost = float(r[part] @ r[part])
-        found.append(Scores(int(stop - start), cost, np.array([*change, *shift]), own @ own.T * _TWICE, moments))
+        found.append(Scores(int(stop - start), cost, gradient, sums[:, :9] * _TWICE, moments))
     return found
+
+
+def products_of(rows: Array, some: int, start: int, stop: int) -> Array:
+    """(some, K) products of the first rows of (K, n) with all of them, summed from start to stop.
+
+    A few thousand columns at a time, and never a matrix with its own transpose alone: BLAS is two to three times slower
+    at both.
+    """
+    total = np.zeros((some, len(rows)))
+    for first in range(start, stop, _COLUMNS):
+        part = rows[:, first : min(first + _COLUMNS, stop)]
+        total += part[:some] @ part.T
+    return total
 
 
 def fit_scalar(y: Array, total_field: Array, reference_noise: float = 0.0, complete: bool = True) -> ScalarFit:
@@ -301,10 +332,3 @@ def stepped(matrix: Array, offset: Array, step: Array) -> tuple[Array, Array]:
         change[i, j] = change[j, i] = value
     moved = change @ matrix
     return moved, offset - np.linalg.solve(moved, step[6:])
-
-
-def _dot(a: Array, b: Array) -> Array:
-    out: Array = a[0] * b[0]
-    out += a[1] * b[1]
-    out += a[2] * b[2]
-    return out

@@ -71,10 +71,11 @@ def even_blocks(count: int, samples: int) -> NDArray[np.intp]:
     if samples >= count:
         return np.arange(count)
     blocks = max(samples // BLOCK, 1)
-    room = count / blocks - BLOCK
+    room = max(count / blocks - BLOCK, 0.0)
     jitter = np.random.default_rng(0).uniform(size=blocks)
-    starts = np.floor(np.arange(blocks) * (count / blocks) + jitter * max(room, 0.0)).astype(np.intp)
-    return np.unique((starts[:, None] + np.arange(BLOCK)).ravel())
+    starts = np.floor(np.arange(blocks) * (count / blocks) + jitter * room).astype(np.intp)
+    chosen = (starts[:, None] + np.arange(BLOCK)).ravel()
+    return chosen if room else np.unique(chosen)
 
 
 def even_samples(count: int, samples: int) -> NDArray[np.intp]:

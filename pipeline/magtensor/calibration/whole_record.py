@@ -114,8 +114,9 @@ def _read(
             z -= sums.centre[:, None]
             seen = along(scalar.matrix, offset, z[:3], reference, reference_noise)
             if limits is not None:
-                good = _believed(seen, z, limits) | ~np.isfinite(seen.residual)
+                good = _believed(seen, z, limits)
                 if not good.all():
+                    good |= ~np.isfinite(seen.residual)
                     here[here] = good
                     z, reference = z[:, good], reference[good]
                     seen = along(scalar.matrix, offset, z[:3], reference, reference_noise)
