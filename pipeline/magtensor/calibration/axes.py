@@ -7,6 +7,7 @@ between their calibrated outputs then mirrors, or is a signed permutation of the
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cache
 from itertools import permutations, product
 
 import numpy as np
@@ -18,13 +19,20 @@ _NAMES = "xyz"
 
 def nearest_permutation(rotation: Array) -> Array:
     """The signed permutation matrix (3, 3) nearest to an orthogonal matrix (3, 3), of either determinant."""
-    best = np.eye(3)
-    for order in permutations(range(3)):
-        for signs in product((1.0, -1.0), repeat=3):
-            candidate = np.eye(3)[list(order)] * np.array(signs)[:, None]
-            if np.sum(candidate * rotation) > np.sum(best * rotation) + 1e-9:
-                best = candidate
-    return best
+    likeness = np.einsum("kij,ij->k", _signed_permutations(), rotation)
+    return _signed_permutations()[int(np.argmax(likeness > likeness.max() - 1e-9))]  # of equals the first
+
+
+@cache
+def _signed_permutations() -> Array:
+    """(48, 3, 3), the identity first."""
+    return np.array(
+        [
+            np.eye(3)[list(order)] * np.array(signs)[:, None]
+            for order in permutations(range(3))
+            for signs in product((1.0, -1.0), repeat=3)
+        ]
+    )
 
 
 def describe_axes(rotation: Array, sensor: str, reference: str) -> str:

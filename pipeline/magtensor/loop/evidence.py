@@ -81,6 +81,14 @@ class Grams:
 
 
 @dataclass(frozen=True)
+class Columns:
+    """Columns of P terms along the field, base @ mix, of few that are worked on: base (N, Q), mix (Q, P)."""
+
+    base: Array
+    mix: Array
+
+
+@dataclass(frozen=True)
 class Whitened:
     """A residual, the fit's own freedom and the models already in it, in noise made white: what new terms are added to.
 
@@ -89,7 +97,7 @@ class Whitened:
         z, e: (N, 4) affine functions and (N, 3 S) the residual across; None for a single sensor.
         inner, r: (N, 12) and (N,) along; None without a total field.
         given: terms that are in already; None without any.
-        series, columns: their series (N, K) across and columns (N, P) along; None where there are none.
+        series, columns: their series (N, K) across and columns along; None where there are none.
         over_time: whether the rows are samples; where only sums over all of them are asked for they need not be.
     """
 
@@ -102,7 +110,7 @@ class Whitened:
     r: Array | None
     given: Terms | None = None
     series: Array | None = None
-    columns: Array | None = None
+    columns: Columns | None = None
     over_time: bool = True
 
     @classmethod
@@ -132,9 +140,12 @@ class Whitened:
             return None
         return self.across.whiten(terms.series, back=self.over_time)
 
-    def columns_of(self, terms: Terms) -> Array | None:
-        """(N, P) whitened as the residual along; None where there is none."""
-        return None if self.r is None else self.along.whiten(_along(self.residual, terms), back=self.over_time)
+    def columns_of(self, terms: Terms) -> Columns | None:
+        """Whitened as the residual along; None where there is none."""
+        if self.r is None:
+            return None
+        found = _along(self.residual, terms)
+        return replace(found, base=self.along.whiten(found.base, back=self.over_time))
 
 
 def grams(residual: Residual, terms: Terms, across: Colour, along: Colour | TurnedColour, blocks: int = 1) -> Grams:
@@ -167,15 +178,12 @@ def grams_in(white: Whitened, terms: Terms | None, blocks: int = 1) -> Grams:
             zd[i], dd[i], de[i] = z[a:b].T @ d[a:b], d[a:b].T @ d[a:b], d[a:b].T @ e[a:b]
     aa, ar, rr = np.zeros((blocks, 12 + p, 12 + p)), np.zeros((blocks, 12 + p)), np.zeros(blocks)
     if white.inner is not None and white.r is not None:
-        columns = [c for c in (white.inner, white.columns) if c is not None]
-        if terms is not None:
-            more = white.columns_of(terms)
-            assert more is not None
-            columns.append(more)
-        every = np.hstack(columns)
+        columns = [Columns(white.inner, np.eye(12))]
+        columns += [c for c in (white.columns, None if terms is None else white.columns_of(terms)) if c is not None]
+        base, mix = np.hstack([c.base for c in columns]), _side_by_side([c.mix for c in columns])
         for i, (a, b) in enumerate(pieces):
-            part, r = every[a:b], white.r[a:b]
-            aa[i], ar[i], rr[i] = part.T @ part, part.T @ r, r @ r
+            part, r = base[a:b], white.r[a:b]
+            aa[i], ar[i], rr[i] = mix.T @ (part.T @ part) @ mix, (part.T @ r) @ mix, r @ r
     samples = np.diff(edges).astype(float)
     return Grams(
         zz, zd, dd, ze, de, ee, aa, ar, rr, samples,
@@ -196,19 +204,38 @@ def _beside(
     return parts[0] if len(parts) == 1 else np.hstack(parts)
 
 
-def _along(residual: Residual, terms: Terms) -> Array:
-    """(N, P): each term's column along the field."""
-    gain = residual.gain / residual.noise
-    if terms.count == len(terms.part_term) and (terms.part_output != REFERENCE).all():  # one part each, the usual case
-        order = np.argsort(terms.part_term)
-        columns = gain[:, terms.part_output[order]]
-        columns *= terms.series[:, terms.part_series[order]]
-        return columns
-    columns = np.zeros((len(residual.affine), terms.count))
-    for t, o, s in zip(terms.part_term, terms.part_output, terms.part_series, strict=True):
-        weight = residual.reference_gain if o == REFERENCE else gain[:, o]
-        columns[:, t] += weight * terms.series[:, s]
-    return columns
+def _side_by_side(parts: list[Array]) -> Array:
+    """The block-diagonal matrix of matrices."""
+    out = np.zeros((sum(len(p) for p in parts), sum(p.shape[1] for p in parts)))
+    row = column = 0
+    for part in parts:
+        out[row : row + len(part), column : column + part.shape[1]] = part
+        row, column = row + len(part), column + part.shape[1]
+    return out
+
+
+def _along(residual: Residual, terms: Terms) -> Columns:
+    """The terms' columns along the field.
+
+    The outputs show along the field through three responses only, so a series that acts on more than three of them has
+    no more columns than three to be worked on.
+    """
+    term, output, series = terms.part_term, terms.part_output, terms.part_series
+    wide = np.bincount(series[output != REFERENCE], minlength=terms.series.shape[1]) > 3
+    own = ~wide[series] | (output == REFERENCE)
+    base = [terms.series[:, series[own]] * residual.shown_along[:, output[own]]]
+    mix = [np.zeros((int(own.sum()), terms.count))]
+    mix[0][np.arange(len(mix[0])), term[own]] = 1.0
+    if wide.any():
+        response, size = residual.slow_modes.response, 3 * int(wide.sum())
+        base.append((terms.series[:, wide, None] * response[:, None, :]).reshape(len(response), size))
+        each = np.zeros((size // 3, 3, terms.count))
+        place = (np.cumsum(wide) - 1)[series[~own]]
+        by_output = residual.basis[output[~own]] / residual.noise[output[~own], None]
+        np.add.at(each, (place[:, None], np.arange(3), term[~own, None]), by_output)
+        mix.append(each.reshape(size, terms.count))
+    found = Columns(np.hstack(base), np.vstack(mix))
+    return found if len(found.mix) <= terms.count else Columns(found.base @ found.mix, np.eye(terms.count))
 
 
 def normal(g: Grams) -> tuple[Array, Array]:

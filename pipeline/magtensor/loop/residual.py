@@ -9,6 +9,7 @@ parameters, show as any affine function z = (b, 1) of the field across, and as t
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,9 +30,8 @@ class Residual:
         along: (N,) whitened; None without a total field.
         affine: (N, 4) (b, 1), b in units of the mean field: the fit's own freedom across.
         inner: (N, 12) the fit's own freedom along; its rank is 9.
-        gain: (N, 3 S) d along / d whitened output.
+        basis: (3 S, 3) of the plane, orthonormal.
         reference_gain: (N,) d along / d total field, 1/nT.
-        projector: (3 S, 3 S).
         noise: (3 S,) nT by which the outputs were divided.
         samples: (N,) their numbers in the survey.
         slow_modes: how slow noise of the sensors shows along.
@@ -41,12 +41,28 @@ class Residual:
     along: Array | None
     affine: Array
     inner: Array
-    gain: Array
+    basis: Array
     reference_gain: Array
-    projector: Array
     noise: Array
     samples: NDArray[np.int_]
     slow_modes: SlowModes
+
+    @cached_property
+    def gain(self) -> Array:
+        """(N, 3 S) d along / d whitened output."""
+        out: Array = self.slow_modes.response @ self.basis.T
+        return out
+
+    @cached_property
+    def projector(self) -> Array:
+        """(3 S, 3 S) off the plane."""
+        out: Array = np.eye(len(self.basis)) - self.basis @ self.basis.T
+        return out
+
+    @cached_property
+    def shown_along(self) -> Array:
+        """(N, 3 S + 1) 1/nT, d along / d raw output, and last d along / d total field."""
+        return np.column_stack([self.gain / self.noise, self.reference_gain])
 
     @property
     def freedom(self) -> int:
@@ -76,7 +92,6 @@ class Residual:
             along=None if self.along is None else self.along[keep],
             affine=self.affine[keep],
             inner=self.inner[keep],
-            gain=self.gain[keep],
             reference_gain=self.reference_gain[keep],
             samples=self.samples[keep],
             slow_modes=SlowModes(self.slow_modes.response[keep]),
@@ -114,9 +129,8 @@ def residual_of(fit: JointFit, raw: Array, total_field: Array | None, reference_
         along=along,
         affine=affine,
         inner=np.einsum("ni,nj->nij", g / spread[:, None], affine).reshape(len(b), 12),
-        gain=(g / spread[:, None]) @ plane.basis.T,
+        basis=plane.basis,
         reference_gain=-1.0 / spread,
-        projector=np.eye(size) - plane.basis @ plane.basis.T,
         noise=plane.noise,
         samples=keep,
         slow_modes=SlowModes(g / spread[:, None]),

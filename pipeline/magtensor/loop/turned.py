@@ -19,6 +19,7 @@ from magtensor.loop.colour import Colour
 LEAST_EXCESS = 1.0  # over the white power: a mode with less is left to the stationary part
 MOST_MODES = 100
 MOST_ENTRIES = 1e7
+STEPS = 8  # of a half wave of the fastest mode
 LAWS = (1.0, 2.0)  # of the power over frequency, tried for a single sensor
 STRENGTHS = np.geomspace(1.0, 1e6, 13)  # of its slowest mode over white noise
 SINGLE_MODES = 40
@@ -27,6 +28,8 @@ SINGLE_MODES = 40
 @dataclass(frozen=True)
 class SlowModes:
     """Cosines over the survey times the response of |b| - F to three common axes.
+
+    The cosines are slow: each is held over `step` samples, an eighth of the fastest half wave at most.
 
     Attributes:
         response: (N, 3) d along / d whitened output in the plane the sensors share.
@@ -38,41 +41,56 @@ class SlowModes:
     def most(self) -> int:
         """How many cosines are used at most."""
         n = len(self.response)
-        return int(max(min(MOST_MODES, MOST_ENTRIES / (3 * n), n // 8), 0))
+        return int(max(min(MOST_MODES, MOST_ENTRIES / (3 * n), n // STEPS), 0))
+
+    @property
+    def step(self) -> int:
+        """Samples over which a cosine is held."""
+        return max(len(self.response) // (STEPS * max(self.most, 1)), 1)
+
+    @cached_property
+    def _held(self) -> Array:
+        """(B, step, 3) the response, with zeros after the end."""
+        return self._in_steps(self.response)
 
     def seen_in(self, series: Array) -> Array:
         """(3 K, Q) products of (N, Q) with each cosine times response, three for each cosine, the slowest first."""
         from scipy.fft import dct
 
-        n, k = len(self.response), self.most
-        turned = self.response.T[:, None, :] * series.T
-        sums = dct(turned, axis=2)[:, :, 1 : k + 1] / np.sqrt(2.0 * n)
-        out: Array = sums.transpose(2, 0, 1).reshape(3 * k, -1)
-        return out
+        sums = np.einsum("bsj,bsq->bjq", self._held, self._in_steps(series))
+        out: Array = dct(sums, axis=0)[1 : self.most + 1] / np.sqrt(2.0 * len(series))
+        return out.reshape(3 * self.most, -1)
 
     def made_of(self, coefficients: Array) -> Array:
         """(N, Q) series that have such coefficients (3 K', Q) in the slowest cosines times response."""
         from scipy.fft import dct
 
-        n, q = len(self.response), coefficients.shape[1]
-        k = len(coefficients) // 3
-        spectrum = np.zeros((3, q, n))
-        spectrum[:, :, 1 : k + 1] = coefficients.reshape(k, 3, q).transpose(1, 2, 0) / np.sqrt(2.0 * n)
-        out: Array = np.einsum("nj,jqn->nq", self.response, dct(spectrum, axis=2, type=3))
-        return out
+        k, q, n = len(coefficients) // 3, coefficients.shape[1], len(self.response)
+        spectrum = np.zeros((len(self._held), 3, q))
+        spectrum[1 : k + 1] = coefficients.reshape(k, 3, q) / np.sqrt(2.0 * n)
+        out: Array = np.einsum("bsj,bjq->bsq", self._held, dct(spectrum, axis=0, type=3)).reshape(-1, q)
+        return out[:n]
 
     @cached_property
     def gram(self) -> Array:
         """(3 K, 3 K): a product of two cosines is half the sum of those of their difference and sum."""
         from scipy.fft import dct
 
-        n, k = len(self.response), self.most
-        products = self.response[:, :, None] * self.response[:, None, :]
-        sums = dct(products, axis=0, type=2)[: 2 * k + 1] / 2.0
+        k = self.most
+        products = np.einsum("bsi,bsj->bij", self._held, self._held)
+        sums = dct(products, axis=0)[: 2 * k + 1] / 2.0
         order = np.arange(1, k + 1)
         pairs = sums[np.abs(order[:, None] - order)] + sums[order[:, None] + order]
-        out: Array = (pairs / n).transpose(0, 2, 1, 3).reshape(3 * k, 3 * k)
+        out: Array = (pairs / len(self.response)).transpose(0, 2, 1, 3).reshape(3 * k, 3 * k)
         return out
+
+    def _in_steps(self, series: Array) -> Array:
+        """(B, step, Q) of (N, Q), zeros after the end."""
+        n, q = series.shape
+        steps = -(-n // self.step)
+        if n < steps * self.step:
+            series = np.concatenate([series, np.zeros((steps * self.step - n, q))])
+        return series.reshape(steps, self.step, q)
 
 
 @dataclass(frozen=True)
