@@ -19,7 +19,7 @@ from magtensor.loop.correction import corrected_raw
 from magtensor.loop.model import Adopted, Fitting, joint_state
 from magtensor.loop.multiplicity import effective_tests
 from magtensor.loop.quiet import quieted
-from magtensor.loop.screening import rarity
+from magtensor.loop.scoring import rarity
 from magtensor.loop.turned import SlowModes, TurnedColour, excess_of, excess_of_one
 from magtensor.registry import Registry
 

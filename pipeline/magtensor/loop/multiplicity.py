@@ -10,9 +10,8 @@ from magtensor.calibration.types import Array
 from magtensor.loop.terms import Terms
 
 
-def projected(terms: Terms, affine: Array) -> Array:
-    """The series (N, K) of terms without what the fit's own freedom (N, 4) follows, of unit length."""
-    basis, _ = np.linalg.qr(affine)
+def projected(terms: Terms, basis: Array) -> Array:
+    """The series (N, K) of terms, of unit length, without what they have in an orthonormal basis (N, Q)."""
     left = terms.series - basis @ (basis.T @ terms.series)
     size = np.linalg.norm(left, axis=0)
     out: Array = left / np.where(size > 0, size, 1.0)

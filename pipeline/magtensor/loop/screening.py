@@ -14,11 +14,8 @@ from magtensor.errors import UsageError
 from magtensor.loop.assessment import (
     WHITE,
     Assessment,
-    Colours,
     assess,
     colours_of,
-    estimated_in,
-    explained,
     likeliest,
 )
 from magtensor.loop.evidence import Whitened
@@ -27,6 +24,7 @@ from magtensor.loop.log_noise import brought_in
 from magtensor.loop.model import Adopted, State, regressors
 from magtensor.loop.multiplicity import alike, effective_tests, projected
 from magtensor.loop.residual import Residual
+from magtensor.loop.scoring import Scorer
 from magtensor.loop.separation import Assessed, lower_orders, lowest
 from magtensor.loop.settings import EventTimes, Range
 from magtensor.loop.terms import Terms, joined
@@ -203,12 +201,14 @@ class _Thinned:
 
     Attributes:
         every, own: what models see of all samples, and of these.
+        freedom: (n, 4) orthonormal, what the fit's own freedom follows.
         white, coloured: in white noise and in noise of the residual's own colour.
     """
 
     residual: Residual
     every: Excitation
     own: Excitation
+    freedom: Array
     white: Scorer
     coloured: Scorer
 
@@ -217,7 +217,7 @@ class _Thinned:
         residual, given = _thinned(state, SCREENING_SAMPLES)
         colours, x = colours_of(residual), state.excitation
         scorers = Scorer(residual, given, WHITE), Scorer(residual, given, colours)
-        return cls(residual, x, x.at(residual.samples), *scorers)
+        return cls(residual, x, x.at(residual.samples), np.linalg.qr(residual.affine)[0], *scorers)
 
     def terms(self, model: Component, settings: Mapping[str, Any], failed: dict[str, str]) -> Terms | None:
         """As `_terms`, at the samples."""
@@ -246,7 +246,7 @@ def _best_settings(
         if terms is None or not terms.count:
             continue
         scores.append((few.white(terms), few.coloured(terms), settings))
-        series = projected(terms, few.residual.affine)
+        series = projected(terms, few.freedom)
         if last is not None:
             chain.append(alike(last, series))
         last = series
@@ -316,31 +316,6 @@ def _terms(model: Component, settings: Mapping[str, Any], x: Excitation, failed:
         failed[model.name] = "its regressors are not finite on this survey"
         return None
     return terms
-
-
-class Scorer:
-    """How unlikely it is that as many random regressors explain as much beyond the adopted terms: -log of chance."""
-
-    def __init__(self, residual: Residual, adopted: Terms | None, colours: Colours) -> None:
-        self.white = Whitened.of(residual, colours.across, colours.along, adopted, over_time=False)
-        self.own = 0.0 if adopted is None else explained(estimated_in(self.white, None))
-
-    def __call__(self, terms: Terms) -> float:
-        estimate = estimated_in(self.white, terms)
-        return rarity(explained(estimate) - self.own, max(min(estimate.rank, terms.count), 1))
-
-
-def rarity(explained: float, rank: int) -> float:
-    """-log of the probability that chi-square with `rank` degrees of freedom exceeds a value, however small that is."""
-    from math import lgamma, log
-
-    from scipy.special import chdtrc
-
-    tail = float(chdtrc(rank, max(explained, 0.0)))
-    if tail > 1e-250:
-        return -log(tail)
-    half = explained / 2.0
-    return half - (rank / 2.0 - 1.0) * log(half) + lgamma(rank / 2.0)
 
 
 def _refined(model: Component, settings: dict[str, Any], state: State, failed: dict[str, str]) -> dict[str, Any]:

@@ -23,7 +23,8 @@ from magtensor.loop.latent import NAME, Sought, renewed, sought, tried_source
 from magtensor.loop.model import Adopted, Fitting, Record, State, joint_state
 from magtensor.loop.needs import missing
 from magtensor.loop.residual import Residual
-from magtensor.loop.screening import ALPHA, Candidate, Scorer, candidates_of, generic, golden, profiled, repeatable
+from magtensor.loop.scoring import Scorer
+from magtensor.loop.screening import ALPHA, Candidate, candidates_of, generic, golden, profiled, repeatable
 from magtensor.loop.separation import SEPARATION, fold_gain, separated
 from magtensor.loop.settings import Range
 from magtensor.loop.spectrum import spectral_lines

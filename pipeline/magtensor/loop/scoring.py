@@ -1,0 +1,33 @@
+"""How unlikely it is that chance explains as much as terms do: what settings are profiled and models ranked by."""
+
+from __future__ import annotations
+
+from math import lgamma, log
+
+from magtensor.loop.assessment import Colours, estimated_in, explained
+from magtensor.loop.evidence import Whitened
+from magtensor.loop.residual import Residual
+from magtensor.loop.terms import Terms
+
+
+class Scorer:
+    """How unlikely it is that as many random regressors explain as much beyond the adopted terms: -log of chance."""
+
+    def __init__(self, residual: Residual, adopted: Terms | None, colours: Colours) -> None:
+        self.white = Whitened.of(residual, colours.across, colours.along, adopted, over_time=False)
+        self.own = 0.0 if adopted is None else explained(estimated_in(self.white, None))
+
+    def __call__(self, terms: Terms) -> float:
+        estimate = estimated_in(self.white, terms)
+        return rarity(explained(estimate) - self.own, max(min(estimate.rank, terms.count), 1))
+
+
+def rarity(explained: float, rank: int) -> float:
+    """-log of the probability that chi-square with `rank` degrees of freedom exceeds a value, however small that is."""
+    from scipy.special import chdtrc
+
+    tail = float(chdtrc(rank, max(explained, 0.0)))
+    if tail > 1e-250:
+        return -log(tail)
+    half = explained / 2.0
+    return half - (rank / 2.0 - 1.0) * log(half) + lgamma(rank / 2.0)
