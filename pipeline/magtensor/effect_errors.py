@@ -2,8 +2,9 @@
 
 C and o are the closed-form fit of the outputs less what the error models add, so they follow the coefficients: taking a
 unit of a regressor off the outputs moves them by what an affine function of the field can make of it, across the plane
-that the sensors share and along the field. The coefficients' covariance has C and o free, that of the fit has them
-given; with the derivative K the joint covariance is [[Sigma + K Theta K', K Theta], [Theta K', Theta]].
+that the sensors share and along the field (and across known directions). The coefficients' covariance has C and o free,
+that of the fit has them given; with the derivative K the joint covariance is
+[[Sigma + K Theta K', K Theta], [Theta K', Theta]]. Of several surveys o is that of each.
 """
 
 from __future__ import annotations
@@ -14,19 +15,28 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from magtensor.calibrated import MATRIX_ENTRIES, OFFSET_ENTRIES
+from magtensor.calibration.common_field import CommonField
+from magtensor.calibration.common_scale import nominal
 from magtensor.calibration.joint import calibrated, nearest_frame
-from magtensor.calibration.joint_covariance import frame_projection, to_corrections
+from magtensor.calibration.joint_covariance import frame_projection
+from magtensor.calibration.surveys.corrections import SurveysCalibration
+from magtensor.calibration.surveys.covariance import to_corrections, with_offset
+from magtensor.calibration.surveys.fit import frame_of
 from magtensor.calibration.types import Array, ArrayCalibration
 from magtensor.loop.correction import TONE
+from magtensor.loop.evidence import across_directions, along_the_field
 from magtensor.loop.model import Adopted, State
 from magtensor.loop.record import record_of
-from magtensor.loop.terms import REFERENCE, joined
+from magtensor.loop.residual import Residual
+from magtensor.loop.several import SurveysState
+from magtensor.loop.terms import REFERENCE, Terms, joined
 from magtensor.loop.waveform import NAME as HIDDEN
 from magtensor.platform_frame import as_fitted
 from magtensor.survey.model import Survey, Variable
 from magtensor.tensor.uncertainty import TakenOff
 
 COVARIANCE = "calibration/coefficient_covariance"
+_INNER_RANK = 1e-9
 
 
 @dataclass(frozen=True)
@@ -51,48 +61,121 @@ def with_coefficients(state: State) -> WithCoefficients:
     """The calibration of a state with error models, and the joint covariance of its parameters and coefficients."""
     calibration, estimate, terms = calibrated(state.fit), state.estimate, state.terms
     assert estimate is not None and terms is not None
-    slope = _slope(state)
+    q = nearest_frame(state.fit.forward)
+    slope = _slope(state.residual, terms, state.fit.plane, state.fit.forward, q, tied=False)
+    slope = with_offset(len(calibration.matrix), np.ones(1)) @ slope
     theta = estimate.covariance
     own = calibration.covariance + slope @ theta @ slope.T
     mixed = slope @ theta
-    models = [a.name for a, t in zip(state.adopted, state.theta, strict=True) for _ in t]
-    names = (":".join(p for p in parts if p) for parts in zip(models, terms.sensors, terms.names, strict=True))
-    free, open_ = calibration.unobservable, terms.count - estimate.rank
-    if open_:
-        words = f"{open_} of {terms.count} directions of the coefficients of {', '.join(dict.fromkeys(models))}"
-        free = (*free, f"{words}: no data show them, and they were left zero")
+    names, words = _names(state, terms), _open_words(state, terms)
     return WithCoefficients(
-        replace(calibration, covariance=own, unobservable=free),
+        replace(calibration, covariance=own, unobservable=(*calibration.unobservable, *words)),
         np.block([[own, mixed], [mixed.T, theta]]),
-        tuple(names),
+        names,
         np.concatenate(state.theta),
-        open_,
+        terms.count - estimate.rank,
     )
 
 
-def _slope(state: State) -> Array:
-    """K (12 S, P): derivative of the corrections and offsets with the coefficients."""
-    fit, residual, terms = state.fit, state.residual, state.terms
-    assert terms is not None
-    q = nearest_frame(fit.forward)
-    forward = fit.forward @ q
+@dataclass(frozen=True)
+class SurveysWithCoefficients:
+    """The calibration of several surveys whose covariance holds what the coefficients leave open.
+
+    Attributes:
+        calibration: as in `WithCoefficients`.
+        mixed: (9 S + 3 S K, P) covariance of its parameters with the coefficients; theta: (P, P) of these alone.
+        names, values, open: as in `WithCoefficients`.
+    """
+
+    calibration: SurveysCalibration
+    mixed: Array
+    theta: Array
+    names: tuple[str, ...]
+    values: Array
+    open: int
+
+    def nominal(self) -> SurveysWithCoefficients:
+        """The same with nominal mean sensitivity, as `SurveysCalibration.nominal`."""
+        mixed, matrix = self.mixed.copy(), self.calibration.common.matrix
+        size = 9 * len(matrix)
+        mixed[:size] = nominal(matrix).jacobian @ mixed[:size]
+        return replace(self, calibration=self.calibration.nominal(), mixed=mixed)
+
+    def beside(self, calibration: ArrayCalibration, mean: bool) -> WithCoefficients:
+        """One survey's calibration with the joint covariance: that of the first, or of another with the mean offset."""
+        count = len(self.calibration.offset)
+        weights = np.full(count, 1.0 / count) if mean else np.eye(count)[0]
+        mixed = with_offset(len(calibration.matrix), weights) @ self.mixed
+        joint = np.block([[calibration.covariance, mixed], [mixed.T, self.theta]])
+        return WithCoefficients(calibration, joint, self.names, self.values, self.open)
+
+
+def surveys_with_coefficients(state: SurveysState, found: SurveysCalibration) -> SurveysWithCoefficients:
+    """The calibration of surveys with error models, and what its parameters have in common with the coefficients.
+
+    Args:
+        found: of the state's fit, the coefficients given.
+    """
+    fit, theta = state.fit, state.estimate.covariance
+    tied = fit.attitude_std is not None
+    slope = _slope(state.residual, state.terms, fit.plane, fit.forward, frame_of(fit.forward, tied), tied=tied)
+    grown = slope @ theta @ slope.T
+    first = with_offset(len(fit.forward), np.eye(len(fit.offset))[0])
+    common = replace(
+        found.common,
+        covariance=found.common.covariance + first @ grown @ first.T,
+        unobservable=(*found.common.unobservable, *_open_words(state, state.terms)),
+    )
+    return SurveysWithCoefficients(
+        SurveysCalibration(common, found.offset, found.covariance + grown),
+        slope @ theta,
+        theta,
+        _names(state, state.terms),
+        np.concatenate(state.theta),
+        state.terms.count - state.estimate.rank,
+    )
+
+
+def _names(state: State | SurveysState, terms: Terms) -> tuple[str, ...]:
+    """Of all coefficients."""
+    models = [a.name for a, t in zip(state.adopted, state.theta, strict=True) for _ in t]
+    return tuple(":".join(p for p in parts if p) for parts in zip(models, terms.sensors, terms.names, strict=True))
+
+
+def _open_words(state: State | SurveysState, terms: Terms) -> tuple[str, ...]:
+    """What to say of directions of the coefficients that no data show."""
+    assert state.estimate is not None
+    open_ = terms.count - state.estimate.rank
+    words = f"{open_} of {terms.count} directions of the coefficients of {', '.join(a.name for a in state.adopted)}"
+    return (f"{words}: no data show them, and they were left zero",) if open_ else ()
+
+
+def _slope(residual: Residual, terms: Terms, plane: CommonField, forward: Array, q: Array, *, tied: bool) -> Array:
+    """K (9 S + 3 S K, P): derivative of the corrections, and of the offsets of K surveys, with the coefficients.
+
+    Args:
+        forward: (S, 3, 3) C of the fit; q: (3, 3) brings it to the frame of the calibration; tied: known directions do.
+    """
+    turned = forward @ q
     sensors, size = len(forward), 3 * len(forward)
-    # `affine` holds the field in units of its mean length, the moments hold it in nT
-    squares = float(np.sum(residual.affine[:, :3] ** 2))
-    unit = float(np.sqrt(np.trace(fit.scalar.scores.moments[:3, :3]) / squares))
-    across, along = np.linalg.pinv(residual.affine), np.linalg.pinv(residual.inner, rcond=1e-9)
-    moved = np.empty((12 * sensors, terms.count))
-    for k, one in enumerate(np.eye(terms.count)):
+    across, inner = np.linalg.pinv(residual.affine), residual.inner
+    columns = along_the_field(residual, terms)
+    seen = columns.base @ columns.mix
+    if residual.sighted is not None:
+        inner = np.concatenate([inner, residual.sighted.inner])
+        seen = np.concatenate([seen, across_directions(residual, terms)])
+    inside = np.linalg.lstsq(inner, seen, rcond=_INNER_RANK)[0]
+    at = with_offset(sensors, np.ones(1))[:, : 9 * sensors]
+    to_frame = np.eye(9 * sensors) if tied else at.T @ frame_projection(turned) @ at
+    to_frame = to_corrections(np.asarray(np.linalg.inv(turned), dtype=np.float64)) @ to_frame
+    moved = []
+    for one, along in zip(np.eye(terms.count), inside.T, strict=True):
         outputs = terms.contribution(one, size) / residual.noise
-        change = -(across @ (outputs @ residual.projector)).T
-        seen = np.einsum("no,no->n", residual.gain, outputs) + residual.reference_gain * terms.on_reference(one)
-        change -= fit.plane.basis @ (along @ seen).reshape(3, 4)
+        change = -(across @ (outputs @ residual.projector)).T - plane.basis @ along.reshape(3, -1)
         change *= residual.noise[:, None]
-        response = change[:, :3].reshape(sensors, 3, 3) @ q / unit
-        moved[:, k] = np.concatenate([response.reshape(sensors, 9), change[:, 3].reshape(sensors, 3)], axis=1).ravel()
-    matrix = np.asarray(np.linalg.inv(forward), dtype=np.float64)
-    out: Array = to_corrections(matrix) @ frame_projection(forward) @ moved
-    return out
+        response = change[:, :3].reshape(sensors, 3, 3) @ q / residual.unit
+        moved.append(np.concatenate([to_frame @ response.ravel(), change[:, 3:].T.ravel()]))
+    return np.stack(moved, axis=1)
 
 
 def coefficient_variables(found: WithCoefficients, sensors: Sequence[str]) -> dict[str, Variable]:

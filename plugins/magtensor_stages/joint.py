@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from magtensor import DataError, ErrorModelsChoice, NotEnoughData, UsageError, stage
+from magtensor import ErrorModelsChoice, NotEnoughData, UsageError, stage
 from magtensor.calibration.coverage import WORST_ERROR
-from magtensor.components import Component, Declares
+from magtensor.components import Declares
 from magtensor.survey.flags import flag_ranges
 from magtensor_methods.scalar_options import WorstError
-from magtensor_stages import joint_surveys
+from magtensor_stages import joint_effects, joint_surveys
 from magtensor_stages.joint_changing import changing_with_date
 from magtensor_stages.sensors import COMMON, common_frame, naming
 
@@ -71,9 +71,7 @@ OffsetTaken = Annotated[
 ]
 
 
-ALONE = (
-    "calibrate_joint: error_models are fitted to one survey with a measured total field and without a vector reference"
-)
+NOT_DATED = "calibrate_joint: error_models are not fitted together with {}: linear; leave one of them out"
 DATED = "calibrate_joint: {}: linear needs further surveys (survey: {{with: [...]}}), at other dates"
 UNMEASURED = (
     "calibrate_joint: a change with the date needs a measured total field; one that is unknown in each survey hides a "
@@ -102,7 +100,7 @@ def declares(options: Mapping[str, Any], *, several: bool = False) -> Declares:
     gives = COMMON if "total_field" in needs else always
     uses: tuple[str, ...] = ("total_field", "reference/total_field", "segment", "attitude", "reference/world_field")
     if options["error_models"]:
-        uses = ("*", "reference/time", "reference/total_field")
+        uses = ("*", *uses, "reference/time")
     return Declares(
         tuple(needs),
         uses,
@@ -132,8 +130,9 @@ def _require_agreement(
             raise UsageError(UNMEASURED)
     if offset_of == "mean" and (offsets != "own" or not several):
         raise UsageError(MEAN_OF_OWN)
-    if error_models and (field.vector or not field.measured or several):
-        raise UsageError(ALONE)
+    for name, value in (("matrices", matrices), ("offsets", offsets)):
+        if value == "linear" and error_models:
+            raise UsageError(NOT_DATED.format(name))
 
 
 def calibrate_recording(
@@ -202,14 +201,20 @@ def calibrate_joint(
             f"calibrate_joint: total_field_nT: {total_field_nT:g} would put the survey's measured total field aside; "
             "leave it out, or say total_field: constant"
         )
-    if error_models:
-        return _with_error_models(survey, dict(error_models), reference_noise_nT, robust, worst_error)
-    if several or field.vector or field.kind.startswith("per_"):
+    chosen, effects = dict(error_models), None
+    extra: dict[str, Any] = {}
+    plain = field.measured and not field.vector and not several
+    if chosen and plain:
+        effects, doubted = joint_effects.of_one_survey(survey, chosen, reference_noise_nT, robust, worst_error)
+        calibration = effects.found.calibration
+    elif chosen or several or field.vector or field.kind.startswith("per_"):
         how = (reference_noise_nT, attitude_std_deg, robust, worst_error)
         if "linear" in (matrices, offsets):
             calibration, extra, doubted = changing_with_date(survey, field, how, matrices, offsets, offset_of == "mean")
         else:
-            calibration, extra, doubted = _from_surveys(survey, field, how, offsets == "common", offset_of == "mean")
+            calibration, extra, doubted, effects = _from_surveys(
+                survey, field, how, offsets == "common", offset_of == "mean", chosen
+            )
     else:
         where = str(survey.attributes.get("source", ""))
         usable = joint_surveys.usable_samples(survey, field, where)
@@ -222,11 +227,13 @@ def calibrate_joint(
         with naming(survey):
             recording = InMemory(raw, size, usable)
             calibration, doubted = _from_recording(recording, reference_noise_nT, robust, worst_error)
-        extra = {}
         if not field.measured:
             aside = joint_surveys.has_measured_field(survey)
             calibration, _ = _without_reference(calibration, field, float(size[0]), aside)
-    given = common_frame(survey, calibration, "joint") | extra
+    clean = survey if effects is None else effects.cleaned(survey)
+    given = common_frame(clean, calibration, "joint") | extra
+    if effects is not None:
+        given |= effects.variables(survey) | _before(survey)
     if offsets_of := extra.pop("offset_of", ""):
         dims, values, attributes = given["calibration/matrix"]
         given["calibration/matrix"] = (dims, values, dict(attributes) | {"offset_of": offsets_of})
@@ -259,42 +266,13 @@ def _from_recording(
     return calibrated(fit), usable & ~fit.keep
 
 
-def _with_error_models(
-    survey: Survey,
-    chosen: Mapping[str, tuple[Component, Mapping[str, Any]]],
-    reference_noise: float,
-    robust: bool,
-    worst_error: float,
-) -> dict[str, Any]:
-    """The variables of a survey whose outputs and total field hold declared effects."""
-    from magtensor.effect_errors import coefficient_variables, with_coefficients
-    from magtensor.loop.model import Adopted, Fitting, joint_state, require_determined, with_colour
-    from magtensor.loop.needs import missing
-    from magtensor.loop.record import record_of
-    from magtensor.loop.stored import cleaned, effect_variables
-
-    record, where = record_of(survey), str(survey.attributes.get("source", ""))
-    if not len(record.time):
-        raise NotEnoughData("no sample has all sensors in use and a total field", where=where)
-    adopted = [Adopted(component, settings) for component, settings in chosen.values()]
-    for one in adopted:
-        if lacking := missing(one.component, record.excitation(record.raw, record.raw)):
-            needs = " and ".join(lacking)
-            raise DataError(f"the error model {one.name} needs {needs}, which this survey does not show", where=where)
-    how = Fitting(reference_noise, worst_error, searching=False)
-    with naming(survey):
-        state = joint_state(record, adopted, how, keep=None if robust else np.ones(len(record.time), dtype=bool))
-        require_determined(record, state, how)
-    found = with_coefficients(with_colour(record, state, how))
-    calibration = found.calibration
-    clean = cleaned(survey, calibration, adopted, state.theta, record.means)
-    given = common_frame(clean, calibration, "joint") | effect_variables(adopted, state.theta, record.means, survey)
-    given |= coefficient_variables(found, survey.sensors)
+def _before(survey: Survey) -> dict[str, Any]:
+    """|b| - F of the survey as it was, where `common_frame` gives that of the survey without the effects."""
+    if "total_field" not in survey:
+        return {}
     before = np.linalg.norm(survey.values("b_raw"), axis=2) - survey.values("total_field")[:, None]
-    given["residual/total_field_before"] = (("time", "sensor"), before, {"units": "nT", "long_name": "|b_raw| - F"})
-    doubted = np.zeros(len(survey.time), dtype=bool)
-    doubted[record.samples[~state.fit.keep]] = True
-    return given | _flagged(survey, doubted)
+    attributes = {"units": "nT", "long_name": "|b_raw| - F"}
+    return {"residual/total_field_before": (("time", "sensor"), before, attributes)}
 
 
 def _flagged(survey: Survey, doubted: np.ndarray) -> dict[str, Any]:
@@ -333,33 +311,44 @@ def _from_surveys(
     how: tuple[float, float | None, bool, float],
     common_offsets: bool,
     mean: bool,
-) -> tuple[ArrayCalibration, dict[str, Any], np.ndarray]:
-    """The calibration, what else is told of it, and the samples (N,) of this survey that no noise explains."""
+    chosen: joint_effects.Chosen,
+) -> tuple[ArrayCalibration, dict[str, Any], np.ndarray, joint_effects.Effects | None]:
+    """The calibration, what else is told of it, the samples (N,) of this survey that no noise explains, and the effects
+    that were chosen."""
     from magtensor.calibration.surveys.agreeing import disagreement_in_words
     from magtensor.calibration.surveys.corrections import calibrated_surveys
     from magtensor.calibration.surveys.fit import fit_surveys
+    from magtensor.effect_errors import surveys_with_coefficients
     from magtensor.offsets_apart import SCATTER, scatter_variable
 
     reference_noise, attitude_std_deg, robust, worst_error = how
     surveys = joint_surveys.named_surveys(survey)
     names, uses, samples = joint_surveys.gathered(surveys, field)
+    options: dict[str, Any] = {
+        "common_offsets": common_offsets,
+        "reference_noise": reference_noise,
+        "attitude": None if attitude_std_deg is None else float(np.radians(attitude_std_deg)),
+        "robust": robust,
+        "worst_error": worst_error,
+        "mean_field": field.declared,
+    }
+    beside = None
     with naming(survey), joint_surveys.attitude_suspected(surveys, uses, field):
-        fit = fit_surveys(
-            samples,
-            common_offsets=common_offsets,
-            reference_noise=reference_noise,
-            attitude=None if attitude_std_deg is None else float(np.radians(attitude_std_deg)),
-            robust=robust,
-            worst_error=worst_error,
-            mean_field=field.declared,
-        )
-        found = calibrated_surveys(fit)
+        if chosen:
+            state, means = joint_effects.surveys_fitted(surveys, uses, samples, field, chosen, options)
+            fit, samples = state.fit, state.samples
+            beside = surveys_with_coefficients(state, calibrated_surveys(fit))
+            found = beside.calibration
+        else:
+            fit = fit_surveys(samples, **options)
+            found = calibrated_surveys(fit)
     calibration, factor = found.of_another() if mean else found.of_survey(0), 1.0
     if not field.measured:
         aside = any(joint_surveys.has_measured_field(one) for _, one in surveys)
         typical = float(np.mean(fit.found.sums.total_field))
         calibration, factor = _without_reference(calibration, field, typical, aside)
-        found = found if field.declared is not None else found.nominal()
+        if field.declared is None:
+            found, beside = found.nominal(), None if beside is None else beside.nominal()
     else:
         calibration = joint_surveys.with_declared_size(survey, field, calibration)
     extra = joint_surveys.survey_variables(names, fit, found, survey.sensors, factor)
@@ -369,4 +358,8 @@ def _from_surveys(
         calibration.diagnostics["disagreement"] = words
     if words := joint_surveys.offset_words(names, found.offset, mean):
         extra["offset_of"] = words
-    return calibration, extra, joint_surveys.doubted_in(survey, uses[0], fit.keep)
+    if beside is None:
+        effects = None
+    else:
+        effects = joint_effects.Effects(state.adopted, state.theta, means, beside.beside(calibration, mean))
+    return calibration, extra, joint_surveys.doubted_in(survey, uses[0], fit.keep), effects

@@ -174,7 +174,8 @@ def test_the_joint_covariance_is_stored(tmp_path: Path) -> None:
     [
         ("{error_models: [current_field]}", 3, "needs current_*"),
         ("{error_models: [temperature_ofset]}", 2, "did you mean temperature_offset"),
-        ("{error_models: [temperature_offset], total_field_nT: 50000}", 2, "one survey with a measured total field"),
+        ("{error_models: [temperature_offset], matrices: linear}", 2, "needs further surveys"),
+        ("{error_models: [reference_scale], total_field: constant}", 3, "no measured total field"),
         ("{error_models: [latent_source]}", 3, "needs waveform"),
     ],
 )

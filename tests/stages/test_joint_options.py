@@ -335,7 +335,7 @@ def test_mistakes(tmp_path: Path, options: str, further: str, status: int, said:
     [
         ("{offset_of: mean}", "", "offset_of: mean needs further surveys with offsets of their own"),
         ("{offset_of: mean}", ", with: b.h5", ""),
-        ("{error_models: [temperature_offset]}", ", with: b.h5", "error_models are fitted to one survey"),
+        ("{error_models: [temperature_offset], matrices: linear}", ", with: b.h5", "not fitted together with matrices"),
         ("{error_models: [temperature_offset]}", "", ""),
         ("{total_field: constant}", ", with: b.h5", ""),
     ],

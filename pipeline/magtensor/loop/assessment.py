@@ -169,6 +169,8 @@ def log_likelihood(residual: Residual, colours: Colours) -> float:
     if residual.along is not None:
         total += colours.along.log_volume(len(residual.affine))
         total += float(np.sum(colours.along.whiten(residual.along, back=False) ** 2))
+    if residual.sighted is not None:
+        total += float(np.sum(residual.sighted.residual**2))
     return -total / 2.0
 
 

@@ -29,11 +29,12 @@ class Grams:
     """Sums over each of B blocks.
 
     Attributes:
-        zz, zd, dd: (B, 4, 4), (B, 4, K), (B, K, K) of the affine functions z and the series d, whitened.
-        ze, de: (B, 4, 3 S), (B, K, 3 S) with the residual across.
+        zz, zd, dd: (B, A, A), (B, A, K), (B, K, K) of the affine functions z and the series d, whitened.
+        ze, de: (B, A, 3 S), (B, K, 3 S) with the residual across.
         ee: (B,) square of the residual across.
-        aa, ar: (B, 12 + P, 12 + P), (B, 12 + P) of the columns along and with the residual along.
-        rr: (B,) square of the residual along.
+        aa, ar: (B, 3 A + P, 3 A + P), (B, 3 A + P) of the columns along and with the residual along, those of known
+            directions added.
+        rr: (B,) square of the residual along, that of known directions added.
         samples: (B,) how many samples a block holds.
         part_term, part_output, part_series, count: of the terms.
         projector: (3 S, 3 S); noise: (3 S,) nT, of the residual.
@@ -55,6 +56,11 @@ class Grams:
     count: int
     projector: Array
     noise: Array
+
+    @property
+    def own(self) -> int:
+        """3 A, the columns along that are the fit's own freedom."""
+        return int(self.aa.shape[1]) - self.count
 
     def merged(self, blocks: int) -> Grams:
         """The same in fewer, longer blocks of consecutive ones."""
@@ -94,8 +100,8 @@ class Whitened:
 
     Attributes:
         residual: of N samples; across, along: the colours of its two parts.
-        z, e: (N, 4) affine functions and (N, 3 S) the residual across; None for a single sensor.
-        inner, r: (N, 12) and (N,) along; None without a total field.
+        z, e: (N, A) affine functions and (N, 3 S) the residual across; None for a single sensor.
+        inner, r: (N, 3 A) and (N,) along; None without a total field.
         given: terms that are in already; None without any.
         series, columns: their series (N, K) across and columns along; None where there are none.
         over_time: whether the rows are samples; where only sums over all of them are asked for they need not be.
@@ -128,7 +134,7 @@ class Whitened:
             z, e = across.whiten(residual.affine, back=over_time), across.whiten(residual.across, back=over_time)
         if residual.along is not None:
             both = along.whiten(np.column_stack([residual.inner, residual.along]), back=over_time)
-            inner, r = both[:, :12], both[:, 12]
+            inner, r = both[:, :-1], both[:, -1]
         white = cls(residual, across, along, z, e, inner, r, over_time=over_time)
         if given is None:
             return white
@@ -144,7 +150,7 @@ class Whitened:
         """Whitened as the residual along; None where there is none."""
         if self.r is None:
             return None
-        found = _along(self.residual, terms)
+        found = along_the_field(self.residual, terms)
         return replace(found, base=self.along.whiten(found.base, back=self.over_time))
 
 
@@ -167,23 +173,31 @@ def grams_in(white: Whitened, terms: Terms | None, blocks: int = 1) -> Grams:
     n, size = len(residual.affine), len(residual.noise)
     edges = np.linspace(0, n, blocks + 1).round().astype(int)
     pieces = list(itertools.pairwise(edges))
-    k, p = together.series.shape[1], together.count
-    zz, zd, dd = np.zeros((blocks, 4, 4)), np.zeros((blocks, 4, k)), np.zeros((blocks, k, k))
-    ze, de, ee = np.zeros((blocks, 4, size)), np.zeros((blocks, k, size)), np.zeros(blocks)
+    k, p, own = together.series.shape[1], together.count, residual.affine.shape[1]
+    zz, zd, dd = np.zeros((blocks, own, own)), np.zeros((blocks, own, k)), np.zeros((blocks, k, k))
+    ze, de, ee = np.zeros((blocks, own, size)), np.zeros((blocks, k, size)), np.zeros(blocks)
     if white.z is not None and white.e is not None:
         z, e = white.z, white.e
         d = _beside(white.series, white.given, terms, white.series_of)
         for i, (a, b) in enumerate(pieces):
             zz[i], ze[i], ee[i] = z[a:b].T @ z[a:b], z[a:b].T @ e[a:b], np.sum(e[a:b] ** 2)
             zd[i], dd[i], de[i] = z[a:b].T @ d[a:b], d[a:b].T @ d[a:b], d[a:b].T @ e[a:b]
-    aa, ar, rr = np.zeros((blocks, 12 + p, 12 + p)), np.zeros((blocks, 12 + p)), np.zeros(blocks)
+    aa, ar, rr = np.zeros((blocks, 3 * own + p, 3 * own + p)), np.zeros((blocks, 3 * own + p)), np.zeros(blocks)
     if white.inner is not None and white.r is not None:
-        columns = [Columns(white.inner, np.eye(12))]
+        columns = [Columns(white.inner, np.eye(3 * own))]
         columns += [c for c in (white.columns, None if terms is None else white.columns_of(terms)) if c is not None]
         base, mix = np.hstack([c.base for c in columns]), _side_by_side([c.mix for c in columns])
         for i, (a, b) in enumerate(pieces):
             part, r = base[a:b], white.r[a:b]
             aa[i], ar[i], rr[i] = mix.T @ (part.T @ part) @ mix, (part.T @ r) @ mix, r @ r
+    if residual.sighted is not None:
+        every, off = (
+            np.hstack([residual.sighted.inner, across_directions(residual, together)]),
+            residual.sighted.residual,
+        )
+        for i, (a, b) in enumerate(pieces):
+            part, r = every[2 * a : 2 * b], off[2 * a : 2 * b]
+            aa[i], ar[i], rr[i] = aa[i] + part.T @ part, ar[i] + part.T @ r, rr[i] + r @ r
     samples = np.diff(edges).astype(float)
     return Grams(
         zz, zd, dd, ze, de, ee, aa, ar, rr, samples,
@@ -214,20 +228,34 @@ def _side_by_side(parts: list[Array]) -> Array:
     return out
 
 
-def _along(residual: Residual, terms: Terms) -> Columns:
-    """The terms' columns along the field.
+def along_the_field(residual: Residual, terms: Terms) -> Columns:
+    """The terms' columns along the field."""
+    found = _columns(residual, terms, residual.slow_modes.response, residual.shown_along)
+    return found if residual.levels is None else replace(found, base=residual.levels.off(found.base))
 
-    The outputs show along the field through three responses only, so a series that acts on more than three of them has
+
+def across_directions(residual: Residual, terms: Terms) -> Array:
+    """(2 N, P): the terms' columns across known directions."""
+    assert residual.sighted is not None
+    twice = terms.at(np.repeat(np.arange(len(terms.series)), 2))
+    found = _columns(residual, twice, residual.sighted.response, residual.shown_sighted)
+    return found.base @ found.mix
+
+
+def _columns(residual: Residual, terms: Terms, response: Array, shown: Array) -> Columns:
+    """The terms' columns in rows of whitened values.
+
+    The outputs show in each of them through three responses only, so a series that acts on more than three of them has
     no more columns than three to be worked on.
     """
     term, output, series = terms.part_term, terms.part_output, terms.part_series
     wide = np.bincount(series[output != REFERENCE], minlength=terms.series.shape[1]) > 3
     own = ~wide[series] | (output == REFERENCE)
-    base = [terms.series[:, series[own]] * residual.shown_along[:, output[own]]]
+    base = [terms.series[:, series[own]] * shown[:, output[own]]]
     mix = [np.zeros((int(own.sum()), terms.count))]
     mix[0][np.arange(len(mix[0])), term[own]] = 1.0
     if wide.any():
-        response, size = residual.slow_modes.response, 3 * int(wide.sum())
+        size = 3 * int(wide.sum())
         base.append((terms.series[:, wide, None] * response[:, None, :]).reshape(len(response), size))
         each = np.zeros((size // 3, 3, terms.count))
         place = (np.cumsum(wide) - 1)[series[~own]]
@@ -255,11 +283,12 @@ def normal(g: Grams) -> tuple[Array, Array]:
         n += into @ parts @ into.T
         y += c[:, s, o] @ into.T
     if g.aa.any():
-        own = np.linalg.pinv(g.aa[:, :12, :12], rcond=_INNER_RANK, hermitian=True)
-        mixed = g.aa[:, :12, 12:]
+        m = g.own
+        own = np.linalg.pinv(g.aa[:, :m, :m], rcond=_INNER_RANK, hermitian=True)
+        mixed = g.aa[:, :m, m:]
         turned = np.swapaxes(mixed, 1, 2) @ own
-        n += g.aa[:, 12:, 12:] - turned @ mixed
-        y += g.ar[:, 12:] - (turned @ g.ar[:, :12, None])[:, :, 0]
+        n += g.aa[:, m:, m:] - turned @ mixed
+        y += g.ar[:, m:] - (turned @ g.ar[:, :m, None])[:, :, 0]
     return n, y
 
 
@@ -302,8 +331,9 @@ def _loss(train: Grams, test: Grams, theta: Array) -> Array:
         loss += 2 * np.einsum("bij,bik,bkj->b", own, test.zd, w)
         loss -= 2 * (np.einsum("bij,bij->b", own, test.ze) + np.einsum("bij,bij->b", w, test.de))
     if train.aa.any():
-        inverse = np.linalg.pinv(train.aa[:, :12, :12], rcond=_INNER_RANK, hermitian=True)
-        right = train.ar[:, :12] - np.einsum("bij,bj->bi", train.aa[:, :12, 12:], theta)
+        m = train.own
+        inverse = np.linalg.pinv(train.aa[:, :m, :m], rcond=_INNER_RANK, hermitian=True)
+        right = train.ar[:, :m] - np.einsum("bij,bj->bi", train.aa[:, :m, m:], theta)
         full = np.concatenate([np.einsum("bij,bj->bi", inverse, right), theta], axis=1)
         loss += test.rr - 2 * np.einsum("bi,bi->b", full, test.ar) + np.einsum("bi,bij,bj->b", full, test.aa, full)
     return loss

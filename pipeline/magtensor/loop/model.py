@@ -23,9 +23,9 @@ from magtensor.loop.statistics import Estimate
 from magtensor.loop.stretches import borne_out
 from magtensor.loop.terms import Terms, joined
 
-_MOST_ROUNDS = 6
+MOST_ROUNDS = 6
 _SLACK = 4.0  # in the error accepted while an effect may yet turn out to cause most of it
-_SETTLED = 0.02  # of a standard deviation
+SETTLED = 0.02  # of a standard deviation
 _SHARES = (1.0, 0.5, 0.1)  # of a step, tried in this order
 _LIKELIHOOD_ROUNDING = 0.5  # a spectrum fitted anew is not the same to the last digit
 
@@ -204,7 +204,7 @@ def joint_state(
     raw, reference = record.raw, record.total_field
     estimate: Estimate | None = None
     terms: Terms | None = None
-    for round_ in range(_MOST_ROUNDS):
+    for round_ in range(MOST_ROUNDS):
         fit = _fit(record, raw, reference, how, keep)
         x = excitation_of(record, fit, lines)
         if not adopted:
@@ -225,11 +225,11 @@ def joint_state(
         before = np.concatenate(theta)
         # what no data show stays zero, whatever earlier rounds made of it
         shown = estimate.seen(before)
-        after = shown + _share(residual, terms, estimate.theta, colours) * estimate.theta
+        after = shown + share_of(residual, terms, estimate.theta, colours) * estimate.theta
         theta = np.split(after, edges)
         raw, reference = without(record, each, theta)
         step = np.abs(after - before) / np.sqrt(np.maximum(np.diag(estimate.covariance), 1e-300))
-        if np.max(step, initial=0.0) < _SETTLED:
+        if np.max(step, initial=0.0) < SETTLED:
             fit = _fit(record, raw, reference, how, keep)
             x = excitation_of(record, fit, lines)
             break
@@ -239,7 +239,7 @@ def joint_state(
     return State(tuple(adopted), tuple(theta), fit, residual, x, terms, estimate, tuple(lines))
 
 
-def _share(residual: Residual, terms: Terms, step: Array, colours: Colours) -> float:
+def share_of(residual: Residual, terms: Terms, step: Array, colours: Colours) -> float:
     """The part of a step that makes the residual, in noise of its own colour then, likelier; 0 if none does.
 
     The step is the best one in noise of the colour that the residual has now, and the colour changes with it: a slow

@@ -20,19 +20,29 @@ CLEARANCE = 10.0  # the reference's noise is in the residual too: what held it w
 GAP = 5.0  # median steps: a longer one begins a new run
 
 
-def record_of(survey: Survey, means: Mapping[str, Array] | None = None, *, every: bool = False) -> Record:
+def record_of(
+    survey: Survey,
+    means: Mapping[str, Array] | None = None,
+    *,
+    every: bool = False,
+    use: NDArray[np.bool_] | None = None,
+) -> Record:
     """The samples of a survey that may be used, with its logged channels.
 
     Args:
         survey: with `b_raw` and, where there is one, `total_field`.
         means: what to take off each channel (a stored calibration's); the survey's own means if None.
         every: all samples, flagged or not, as a correction needs; else those a fit may use.
+        use: (N,) those samples, where a fit of several surveys has chosen them. Channels that never change are then
+            kept: another survey may hold another value.
     """
     raw = np.asarray(survey.values("b_raw"), dtype=float)
     time = survey.time
     total_field = np.asarray(survey.values("total_field"), dtype=float) if "total_field" in survey else None
-    use = np.ones(len(time), dtype=bool)
-    if not every:
+    steady = every or use is not None
+    if use is None and every:
+        use = np.ones(len(time), dtype=bool)
+    elif use is None:
         use = survey.good & np.isfinite(raw).all(axis=(1, 2))
         if total_field is not None:
             use &= np.isfinite(total_field)
@@ -47,7 +57,7 @@ def record_of(survey: Survey, means: Mapping[str, Array] | None = None, *, every
     if means is None:
         means = {name: np.asarray(values[keep].mean(axis=0)) for name, values in logged.items()}
     centred = {name: values - means[name] for name, values in logged.items() if name in means}
-    if not every:  # what never changes says nothing
+    if not steady:  # what never changes says nothing
         centred = {n: v for n, v in centred.items() if np.ptp(v[keep], axis=0).max(initial=0.0) > 0}
     segment = np.asarray(survey.values("segment"), dtype=int) if "segment" in survey else np.zeros(len(time), dtype=int)
     whole = Record(

@@ -4,6 +4,9 @@ With outputs divided by their noise, the residual of a sample has two parts (MET
 values *across* the plane that the sensors share, and one *along* the field, |b| - F. A disturbance p (3 S) of the
 outputs shows as Q p across, Q the projector off the plane, and as gain . p along. Changes of C and o, the fit's own
 parameters, show as any affine function z = (b, 1) of the field across, and as twelve products along.
+
+Of several surveys with offsets of their own z has a constant for each. Known directions of the field add two values a
+sample, *sighted*, in which the same products show; a total field that is an unknown constant takes off its part along.
 """
 
 from __future__ import annotations
@@ -22,23 +25,63 @@ from magtensor.loop.turned import SlowModes
 
 
 @dataclass(frozen=True)
+class Sighted:
+    """Directions of the field against known ones, two rows for each of N samples.
+
+    Attributes:
+        residual: (2 N,) whitened; inner: (2 N, 3 A) the fit's own freedom in it.
+        response: (2 N, 3) derivative with the whitened outputs in the plane.
+        reference_gain: (2 N,) 1/nT, derivative with the total field.
+    """
+
+    residual: Array
+    inner: Array
+    response: Array
+    reference_gain: Array
+
+
+@dataclass(frozen=True)
+class Levels:
+    """Unknown constants of the total field.
+
+    Attributes:
+        number: (N,) of the constant at each sample; response: (N,) d along / d constant, 1/nT.
+    """
+
+    number: NDArray[np.int_]
+    response: Array
+
+    def off(self, columns: Array) -> Array:
+        """(N,) or (N, Q) without what the constants can explain."""
+        each = columns.reshape(len(columns), -1)
+        squares = np.bincount(self.number, self.response**2)
+        sums = np.column_stack([np.bincount(self.number, self.response * c) for c in each.T])
+        best = sums / np.where(squares > 0, squares, 1.0)[:, None]
+        out: Array = (each - self.response[:, None] * best[self.number]).reshape(columns.shape)
+        return out
+
+
+@dataclass(frozen=True)
 class Residual:
     """The residual of N samples and its tangent space.
 
     Attributes:
         across: (N, 3 S) whitened, perpendicular to the plane; None for a single sensor.
         along: (N,) whitened; None without a total field.
-        affine: (N, 4) (b, 1), b in units of the mean field: the fit's own freedom across.
-        inner: (N, 12) the fit's own freedom along; its rank is 9.
+        unit: nT, the mean field; affine: (N, A) (b, 1), b in that unit: the fit's own freedom across; A is 4, more
+            where surveys have constants of their own.
+        inner: (N, 3 A) the fit's own freedom along; its rank is 3 A - 3, 3 A with known directions.
         basis: (3 S, 3) of the plane, orthonormal.
         reference_gain: (N,) d along / d total field, 1/nT.
         noise: (3 S,) nT by which the outputs were divided.
         samples: (N,) their numbers in the survey.
         slow_modes: how slow noise of the sensors shows along.
+        sighted: known directions; levels: unknown constants, which `along` and `inner` have been freed of.
     """
 
     across: Array | None
     along: Array | None
+    unit: float
     affine: Array
     inner: Array
     basis: Array
@@ -46,6 +89,8 @@ class Residual:
     noise: Array
     samples: NDArray[np.int_]
     slow_modes: SlowModes
+    sighted: Sighted | None = None
+    levels: Levels | None = None
 
     @cached_property
     def gain(self) -> Array:
@@ -63,6 +108,13 @@ class Residual:
     def shown_along(self) -> Array:
         """(N, 3 S + 1) 1/nT, d along / d raw output, and last d along / d total field."""
         return np.column_stack([self.gain / self.noise, self.reference_gain])
+
+    @cached_property
+    def shown_sighted(self) -> Array:
+        """(2 N, 3 S + 1) 1/nT, the same of known directions."""
+        assert self.sighted is not None
+        gain = self.sighted.response @ self.basis.T
+        return np.column_stack([gain / self.noise, self.sighted.reference_gain])
 
     @property
     def freedom(self) -> int:
@@ -85,7 +137,8 @@ class Residual:
         return total / max(len(self.affine) * self.freedom, 1)
 
     def smaller(self, keep: NDArray[np.int_]) -> Residual:
-        """The same for some of the samples."""
+        """The same for some of the samples of one survey with a measured total field."""
+        assert self.sighted is None and self.levels is None
         return replace(
             self,
             across=None if self.across is None else self.across[keep],
@@ -127,6 +180,7 @@ def residual_of(fit: JointFit, raw: Array, total_field: Array | None, reference_
     return Residual(
         across=across,
         along=along,
+        unit=unit,
         affine=affine,
         inner=np.einsum("ni,nj->nij", g / spread[:, None], affine).reshape(len(b), 12),
         basis=plane.basis,
@@ -149,13 +203,20 @@ def taken_off(residual: Residual, terms: Terms, theta: Array) -> Residual:
     ----------
     terms: with the residual's samples as rows; theta: (P,).
     """
-    across, along = residual.across, residual.along
+    across, along, sighted = residual.across, residual.along, residual.sighted
     raw = terms.contribution(theta, len(residual.noise)) / residual.noise
     if across is not None:
         across = across - raw @ residual.projector
         across = across - residual.affine @ np.linalg.lstsq(residual.affine, across, rcond=None)[0]
     if along is not None:
-        along = along - np.einsum("no,no->n", residual.gain, raw)
-        along = along - residual.reference_gain * terms.on_reference(theta)
-        along = along - residual.inner @ np.linalg.lstsq(residual.inner, along, rcond=1e-9)[0]
-    return replace(residual, across=across, along=along)
+        on_reference = terms.on_reference(theta)
+        moved = np.einsum("no,no->n", residual.gain, raw) + residual.reference_gain * on_reference
+        off, rows = along - (moved if residual.levels is None else residual.levels.off(moved)), residual.inner
+        if sighted is not None:
+            turned = np.einsum("nj,nj->n", sighted.response, np.repeat(raw @ residual.basis, 2, axis=0))
+            turned += sighted.reference_gain * np.repeat(on_reference, 2)
+            off, rows = np.concatenate([off, sighted.residual - turned]), np.concatenate([rows, sighted.inner])
+        off = off - rows @ np.linalg.lstsq(rows, off, rcond=1e-9)[0]
+        along = off[: len(along)]
+        sighted = None if sighted is None else replace(sighted, residual=off[len(along) :])
+    return replace(residual, across=across, along=along, sighted=sighted)

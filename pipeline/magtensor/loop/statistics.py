@@ -71,12 +71,13 @@ def own_information(g: Grams) -> Array:
     raw = g.part_output >= 0
     if raw.any() and g.zz.any():
         dd = np.diagonal(total.dd[0])
-        constant = total.zd[0, 3] ** 2 / max(total.zz[0, 3, 3], 1e-300)
+        squares = np.maximum(np.diagonal(total.zz[0])[3:], 1e-300)
+        constant = np.sum(total.zd[0, 3:] ** 2 / squares[:, None], axis=0)
         size = np.maximum(dd - constant, 1e-12 * dd)
         o = g.part_output[raw]
         np.add.at(out, g.part_term[raw], size[g.part_series[raw]] * g.projector[o, o] / g.noise[o] ** 2)
     if g.aa.any():
-        out += np.diagonal(total.aa[0])[12:]
+        out += np.diagonal(total.aa[0])[g.own :]
     return out
 
 

@@ -44,7 +44,7 @@ def effect_variables(
         for a, t in zip(adopted, theta, strict=True)
     ]
     attributes = {"channel_means": json.dumps({k: np.asarray(v).tolist() for k, v in means.items()})}
-    attributes["start"] = _started(survey).isoformat()
+    attributes["start"] = started(survey).isoformat()
     return {"calibration/effects": (("effect",), np.array(texts, dtype=np.str_), attributes)}
 
 
@@ -76,9 +76,12 @@ def on_its_clock(adopted: Sequence[Adopted], calibration: Survey, survey: Survey
     A jump stays, and a drift holds its last value. Warming up begins anew with every survey.
     """
     begun = calibration["calibration/effects"].attrs.get("start") if adopted else None
-    if begun is None:
-        return list(adopted)
-    seconds = (datetime.fromisoformat(str(begun)) - _started(survey)).total_seconds() + float(survey.time[0])
+    return list(adopted) if begun is None else begun_with(adopted, datetime.fromisoformat(str(begun)), survey)
+
+
+def begun_with(adopted: Sequence[Adopted], begun: datetime, survey: Survey) -> list[Adopted]:
+    """Effects of a survey that began at some date, on the clock of another survey."""
+    seconds = (begun - started(survey)).total_seconds() + float(survey.time[0])
     return [replace(a, start=seconds) if _of_a_time(a) else a for a in adopted]
 
 
@@ -87,7 +90,8 @@ def _of_a_time(model: Adopted) -> bool:
     return any(isinstance(mark, (EventTimes, Duration)) for mark in profiled(model.component).values())
 
 
-def _started(survey: Survey) -> datetime:
+def started(survey: Survey) -> datetime:
+    """The date of a survey's first sample."""
     parts = split_since(str(survey["time"].attrs["units"]))
     assert parts is not None
     return parts[1] + timedelta(seconds=float(survey.time[0]))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -73,6 +73,29 @@ class Terms:
             self.part_output[parts],
             self.part_series[parts],
         )
+
+
+def stacked(parts: Sequence[Terms]) -> Terms:
+    """The terms of one model on several surveys, whose samples are put after each other.
+
+    Raises
+    ------
+    ValueError: the coefficients are not the same on all of them.
+    """
+    first = parts[0]
+    for part in parts[1:]:
+        same = all(np.array_equal(a, b) for a, b in zip(_places(first), _places(part), strict=True))
+        if not same or (part.names, part.sensors, part.units) != (first.names, first.sensors, first.units):
+            told = [
+                ", ".join(dict.fromkeys(f"{n} {u}" for n, u in zip(p.names, p.units, strict=True)))
+                for p in (first, part)
+            ]
+            raise ValueError(f"its coefficients are {told[0]} on one survey and {told[1]} on another")
+    return replace(first, series=np.concatenate([p.series for p in parts]))
+
+
+def _places(terms: Terms) -> tuple[NDArray[np.int_], ...]:
+    return terms.part_term, terms.part_output, terms.part_series
 
 
 def joined(parts: list[Terms]) -> Terms:

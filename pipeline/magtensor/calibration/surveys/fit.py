@@ -86,6 +86,7 @@ def fit_surveys(
     robust: bool = True,
     worst_error: float = WORST_ERROR,
     mean_field: float | None = None,
+    complete: bool = True,
 ) -> SurveysFit:
     """Fit C of all sensors and their offsets to several surveys.
 
@@ -99,6 +100,8 @@ def fit_surveys(
     robust: leave out samples that no noise explains.
     worst_error: see `coverage.coverage`.
     mean_field: nT, the mean over the samples of a total field that is an unknown constant of some of them.
+    complete: the model holds all there is. Where it does not, what an effect without a model leaves must not pass for
+        a lack of attitudes or a broken sensor: neither is asked for, nor what each survey says.
 
     Raises
     ------
@@ -143,9 +146,12 @@ def fit_surveys(
         if own_noise:
             given = output_noise(samples.raw, keep, samples.run)
             given = _told_apart(given, fit, samples) if sensors == 2 else given
-    require_coverage(fit.coverage)
+    if complete:
+        require_coverage(fit.coverage)
     if mean_field is not None and samples.level is not None:
         fit = _scaled(fit, mean_field / float(np.mean(fit.found.sums.total_field)))
+    if not complete:
+        return fit
     used = samples.at(fit.keep)
     _refuse(fit, used)
     forward = fit.forward @ frame_of(fit.forward, fit.attitude_std is not None)
