@@ -31,6 +31,7 @@ CUBIC_COEFFICIENTS = len(TRIPLES)
 _ROUNDING = 1e-14  # the least noise variance assumed, of tensors of order one
 _FALSE_ALARM = 1e-4
 _CLEARLY_VARYING = 10.0  # times the noise variance; a component below does not carry a quadric
+_CLEARLY_STRONG = 20.0  # times the noise; of a weaker source a component may be small in every attitude
 _STANDING_STILL = 1e-6  # of the largest variance of a component: tilts of less than a degree
 
 
@@ -136,11 +137,13 @@ def require_moving(found: Excitation, magnitude: float) -> None:
             hint="rotate nearer to the source",
         )
     if found.still:
+        weak = magnitude < _CLEARLY_STRONG * found.noise_std
         raise NotEnoughData(
-            f"{found.still} of the 5 independent combinations of components do not change beyond noise",
+            f"{found.still} of the 5 independent combinations of components do not change beyond noise"
+            + (f": {found.noise_std:.3g} nT/m, where the tensor's magnitude is {magnitude:.3g} nT/m" if weak else ""),
             where="tensor",
-            hint="rotation about a single axis is not enough, one part of the tensor stays the same: rotate about "
-            "all three axes",
+            hint=("rotate nearer to the source, and about all three axes" if weak else "rotate about all three axes")
+            + ": rotation about a single axis leaves one part of the tensor the same",
         )
 
 
