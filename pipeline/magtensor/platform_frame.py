@@ -113,7 +113,7 @@ def refined(survey: Survey, calibration: ArrayCalibration, worst: float) -> tupl
     Raises:
         NotEnoughData: the survey and what was known do not determine the rotation.
     """
-    from scipy.stats import chi2
+    from scipy.special import chdtrc
 
     done = tie(survey, calibration, ("symmetry",), Declared(), worst)
     if not tied(calibration):
@@ -124,7 +124,7 @@ def refined(survey: Survey, calibration: ArrayCalibration, worst: float) -> tupl
     scale = float(np.trace(before @ before.T))
     seen = values > 1e-6 * scale
     turn = vectors[:, seen].T @ done.found.vector
-    return done, bool(chi2.sf(float(np.sum(turn**2 / values[seen])), max(int(seen.sum()), 1)) < SIGNIFICANT)
+    return done, bool(chdtrc(max(int(seen.sum()), 1), float(np.sum(turn**2 / values[seen]))) < SIGNIFICANT)
 
 
 def in_short(found: CommonRotation) -> str:

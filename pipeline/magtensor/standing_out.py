@@ -88,13 +88,13 @@ def standing_out(parts: list[Array], gradient: Array | None = None) -> Mask:
 def _beyond_noise(parts: list[Array], gradient: Array | None, doubted: Mask) -> Mask:
     """(N,) samples that depart from those before and from those after, to the same side."""
     from scipy.ndimage import median_filter
-    from scipy.stats import chi2
+    from scipy.special import chdtri
 
     count = len(doubted)
     out = np.zeros(count, dtype=bool)
     for values in parts:
         freedom = values.shape[1]
-        limit = chi2.isf(FALSE_REJECTION / (count * len(parts)), freedom) / chi2.median(freedom)
+        limit = chdtri(freedom, FALSE_REJECTION / (count * len(parts))) / chdtri(freedom, 0.5)
         apart = [values - side for side in _beside(values, doubted)]
         scale = np.maximum(np.median(np.abs(apart[0]), axis=0), 1e-300)
         beyond = np.sum(apart[0] * apart[1] / scale**2, axis=1) > 0

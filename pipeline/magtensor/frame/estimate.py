@@ -65,9 +65,9 @@ class CommonRotation:
     @property
     def significance(self) -> float:
         """P value of no rotation at all."""
-        from scipy.stats import chi2
+        from scipy.special import chdtrc
 
-        return float(chi2.sf(self.vector @ np.linalg.solve(self.covariance, self.vector), 3))
+        return float(chdtrc(3, self.vector @ np.linalg.solve(self.covariance, self.vector)))
 
 
 def common_rotation(sources: Sequence[Source], errors: CalibrationErrors, *, worst: float = WORST) -> CommonRotation:
@@ -86,7 +86,7 @@ def common_rotation(sources: Sequence[Source], errors: CalibrationErrors, *, wor
     ------
     NotEnoughData: some rotation stays free; the message says about which axis, and why.
     """
-    from scipy.stats import chi2
+    from scipy.special import chdtri
 
     spreads = [s.spread(np.eye(3)) for s in sources]
     starts = _right_angled()
@@ -95,7 +95,7 @@ def common_rotation(sources: Sequence[Source], errors: CalibrationErrors, *, wor
         minima = _minima(sources, spreads, starts)
         spreads = [s.spread(minima[0][1]) for s in sources]
         starts = [p for _, p in minima]
-    limit = 0.5 * float(chi2.isf(_SAME, 3))
+    limit = 0.5 * float(chdtri(3, _SAME))
     minima = _minima(sources, spreads, starts, _SETTLED)
     close = sorted((p for c, p in minima if c - minima[0][0] <= limit), key=lambda p: angle_between(np.eye(3), p))
     spreads = [s.spread(close[0]) for s in sources]

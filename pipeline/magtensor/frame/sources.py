@@ -68,7 +68,7 @@ def excess(gradients: Array, scatter: Array) -> float:
         gradients: (K, 3) of the cost, one for each block, about the minimum of their sum.
         scatter: (3, 3), covariance of their sum.
     """
-    from scipy.stats import chi2
+    from scipy.special import chdtrc
 
     blocks = len(gradients)
     values, vectors = np.linalg.eigh(scatter)
@@ -79,7 +79,7 @@ def excess(gradients: Array, scatter: Array) -> float:
     white = gradients @ (vectors[:, seen] / np.sqrt(values[seen]))
     ratio = float(np.sum(white**2)) / (rank * (1 - 1 / blocks))
     freedom = rank * (blocks - 1)
-    return ratio if chi2.sf(ratio * freedom, freedom) < ALPHA else 1.0
+    return ratio if chdtrc(freedom, ratio * freedom) < ALPHA else 1.0
 
 
 def edges_of(energy: Array) -> list[slice]:

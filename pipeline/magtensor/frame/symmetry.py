@@ -239,7 +239,7 @@ def _straightness(contrast: Array, shares: Array, differences: Array, variance: 
     the source; the next order, which differences of opposite sensors take for a gradient, is that ratio smaller
     again. Arrays that see no curvature (three sensors, a tetrahedron) weigh all samples alike.
     """
-    from scipy.stats import chi2
+    from scipy.special import chdtri
 
     sensors, linear = shares.shape
     freedom = 3 * (sensors - 1 - linear)
@@ -247,7 +247,7 @@ def _straightness(contrast: Array, shares: Array, differences: Array, variance: 
         return np.ones(len(contrast))
     curved = np.sum((contrast - np.einsum("sd,ndi->nsi", shares, differences)) ** 2, axis=(1, 2))
     gradient = np.sum(differences**2, axis=(1, 2))
-    curved = np.where(curved > chi2.isf(_CURVED, freedom) * variance, curved - freedom * variance, 0.0)
+    curved = np.where(curved > chdtri(freedom, _CURVED) * variance, curved - freedom * variance, 0.0)
     missed = curved**2 / np.maximum(gradient, 1e-300) / (3 * linear)
     out: Array = variance / (variance + missed)
     return out

@@ -151,12 +151,12 @@ def likeliest(residual: Residual, terms: Terms, guesses: Sequence[Colours], firs
 
 def _p_of(blocks: Grams, given: int) -> float:
     """P value of all terms but the first ones, from what they explain in white noise of unit variance."""
-    from scipy.stats import chi2
+    from scipy.special import chdtrc
 
     n, y = normal(blocks.total())
     scale = own_information(blocks)
     every, without = solve(n[0], y[0], scale), solve(n[0, :given, :given], y[0, :given], scale[:given])
-    return float(chi2.sf(explained(every) - explained(without), max(every.rank - without.rank, 1)))
+    return float(chdtrc(max(every.rank - without.rank, 1), max(explained(every) - explained(without), 0.0)))
 
 
 def log_likelihood(residual: Residual, colours: Colours) -> float:

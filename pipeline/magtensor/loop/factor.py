@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtensor.calibration.types import Array
+from magtensor.loop.scoring import rarity
 
 Groups = Sequence[NDArray[np.int_]]
 REACHED = 0.1  # singular value, relative, of a direction of covariances that noise of small correlation can reach
@@ -42,13 +43,11 @@ class Factors:
 
     def log_p(self, samples: float) -> float:
         """Log of the probability of so large a deviance where the model holds; zero where nothing can disagree."""
-        from scipy.stats import chi2
-
         if self.freedom == 0:
             return 0.0
         factors = int(self.direction.any())
         effective = samples - (2 * len(self.covariance) + 5) / 6 - 2 * factors / 3
-        return float(chi2.logsf(max(effective, 0.0) * self.deviance, self.freedom))
+        return -rarity(max(effective, 0.0) * self.deviance, self.freedom)
 
 
 def noise_alone(covariance: Array, basis: Array, groups: Groups) -> Factors:

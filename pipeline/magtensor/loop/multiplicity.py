@@ -37,11 +37,11 @@ def effective_tests(correlations: Sequence[float], alpha: float) -> float:
     correlations: of each test with the one before it.
     alpha: probability at which all tests together are to be judged.
     """
-    from scipy.stats import norm
+    from scipy.special import ndtr, ndtri
 
     if not len(correlations):
         return 1.0
     r = np.clip(np.asarray(correlations, dtype=float), 0.0, 1.0)
-    z = float(norm.isf(alpha / (len(r) + 1) / 2.0))
-    together = 2.0 * norm.sf(z * np.sqrt((1.0 - r) / (1.0 + r)))
+    z = float(-ndtri(alpha / (len(r) + 1) / 2.0))
+    together = 2.0 * ndtr(-z * np.sqrt((1.0 - r) / (1.0 + r)))
     return 1.0 + float(np.sum(1.0 - together))

@@ -105,9 +105,9 @@ def _plain(value: Any) -> Any:
 
 def z_of(p: float) -> float | None:
     """The normal deviate with that two-sided probability."""
-    from scipy.stats import norm
+    from scipy.special import ndtri
 
-    return float(norm.isf(max(p, 1e-300) / 2.0)) if np.isfinite(p) else None
+    return float(-ndtri(max(p, 1e-300) / 2.0)) if np.isfinite(p) else None
 
 
 def _rejected(found: Search) -> list[dict[str, Any]]:

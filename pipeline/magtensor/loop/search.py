@@ -310,10 +310,10 @@ def _spare(state: State, which: int, sensors: tuple[str, ...]) -> bool:
     A coefficient may be insignificant because others can stand in for it, as where only differences between sensors
     are seen (a delay of all of them is a turn of the field): each could go, and not several of them.
     """
-    from scipy.stats import chi2
+    from scipy.special import chdtri
 
     gone, seen, lost = _without_others(state, which, sensors)
-    return seen == gone and lost < float(chi2.isf(KEEP_ALPHA, gone))
+    return seen == gone and lost < float(chdtri(gone, KEEP_ALPHA))
 
 
 def _sufficient(state: State, which: int) -> tuple[str, ...] | None:
@@ -322,14 +322,14 @@ def _sufficient(state: State, which: int) -> tuple[str, ...] | None:
     If only differences between sensors are seen, one that turned is like all others turned the other way: every
     coefficient is significant, or none is. None where no sensor suffices, or several do.
     """
-    from scipy.stats import chi2
+    from scipy.special import chdtri
 
     assert state.terms is not None
     owners = state.terms.sensors[_slices(state)[which]]
     found = []
     for sensor in sorted(set(owners) - {""}):
         gone, seen, lost = _without_others(state, which, (sensor,))
-        if 0 < seen < gone and lost < float(chi2.isf(KEEP_ALPHA, seen)):
+        if 0 < seen < gone and lost < float(chdtri(seen, KEEP_ALPHA)):
             found.append(sensor)
     return tuple(found) if len(found) == 1 else None
 

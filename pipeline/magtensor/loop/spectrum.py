@@ -17,7 +17,7 @@ def spectral_lines(residual: Residual, time: Array, most: int = 5) -> list[tuple
     smooth spectrum can be told from a line, are left out; so are surveys that are not evenly sampled.
     """
     from scipy.fft import rfft
-    from scipy.stats import chi2
+    from scipy.special import chdtrc, chdtri
 
     if len(time) < 256 or residual.across is None:
         return []
@@ -32,7 +32,7 @@ def spectral_lines(residual: Residual, time: Array, most: int = 5) -> list[tuple
     frequency = np.arange(1, len(power) + 1) / (n * step)
     width = max(len(power) // 100, 15)
     smooth = _running_median(power, width)
-    ratio = power / np.maximum(smooth, 1e-300) * chi2.median(2 * k) / 2.0  # to the scale of k exponentials' sum
+    ratio = power / np.maximum(smooth, 1e-300) * chdtri(2 * k, 0.5) / 2.0  # to the scale of k exponentials' sum
     ratio[: 2 * width] = 0.0
     order = np.argsort(-ratio)
     peaks: list[tuple[float, float, float]] = []
@@ -41,7 +41,7 @@ def spectral_lines(residual: Residual, time: Array, most: int = 5) -> list[tuple
             break
         if any(abs(frequency[i] - f) < 3.0 / (n * step) for f, _, _ in peaks):
             continue
-        p = min(1.0, float(chi2.sf(2.0 * ratio[i], 2 * k)) * len(power))
+        p = min(1.0, float(chdtrc(2 * k, 2.0 * ratio[i])) * len(power))
         amplitude = float(np.sqrt(2.0 * power[i] / n / k) * residual.scale)
         peaks.append((float(frequency[i]), amplitude, p))
     return peaks

@@ -122,7 +122,7 @@ def wald_p(g: Grams, chosen: Sequence[int], alone: Sequence[int] = (), most: int
         cannot be seen says nothing of one sensor as long as the other sensors' coefficients are free.
     most: directions tested, those with the most information; all if None.
     """
-    from scipy.stats import f as f_distribution
+    from scipy.special import fdtrc
 
     count = len(g.zz)
     subset = np.asarray(chosen, dtype=int)
@@ -147,7 +147,7 @@ def wald_p(g: Grams, chosen: Sequence[int], alone: Sequence[int] = (), most: int
         t2 = float(theta @ np.linalg.solve(covariance, theta))
     except np.linalg.LinAlgError:
         return 1.0
-    return float(f_distribution.sf((count - p) / (p * (count - 1)) * t2, p, count - p))
+    return float(fdtrc(p, count - p, max((count - p) / (p * (count - 1)) * t2, 0.0)))
 
 
 def _confirmed(basis: Array, n: Array) -> Array:

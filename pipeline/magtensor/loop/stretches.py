@@ -31,7 +31,7 @@ def borne_out(fit: JointFit, raw: Array, total_field: Array, reference_noise: fl
     raw: (N, S, 3) nT and total_field: (N,) nT, those the fit was made from.
     """
     from scipy.ndimage import median_filter
-    from scipy.stats import chi2
+    from scipy.special import chdtri
 
     doubted = np.flatnonzero(~fit.keep)
     every = residual_of(replace(fit, keep=np.ones_like(fit.keep)), raw, total_field, reference_noise)
@@ -41,7 +41,7 @@ def borne_out(fit: JointFit, raw: Array, total_field: Array, reference_noise: fl
     for values, freedom in parts:
         apart = values - median_filter(values, size=(NEIGHBOURS, 1), mode="nearest")
         square = np.sum(apart**2, axis=1)
-        limit = chi2.isf(FALSE_REJECTION / (len(raw) * len(parts)), freedom) / chi2.median(freedom)
+        limit = chdtri(freedom, FALSE_REJECTION / (len(raw) * len(parts))) / chdtri(freedom, 0.5)
         good &= square <= limit * np.median(square)
     out = np.array(fit.keep)
     out[doubted] = good[doubted]
