@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -134,19 +134,11 @@ def settings_grid(model: Component, x: Excitation) -> list[dict[str, Any]]:
 def candidates_of(state: State, models: Sequence[Component], failed: dict[str, str], alpha: float) -> list[Candidate]:
     """The most promising models with their best settings, assessed; their p values corrected for all that was tried."""
     residual = state.residual
-    white = Scorer(residual, state.terms, WHITE)
-    coloured = Scorer(residual, state.terms, state.colours)
     now = Whitened.of(residual, state.colours.across, state.colours.along, state.terms)
-    few = _Thinned.of(state)
-    scored: list[_Screened] = []
-    for model in models:
-        for settings, tried in _best_settings(model, state, few, failed, alpha / max(len(models), 1)):
-            terms = _terms(model, settings, state.excitation, failed)
-            if terms is None or not terms.count:
-                continue
-            terms = terms.at(residual.samples)
-            scored.append(_Screened(model, settings, tried, white(terms), coloured(terms)))
+    scored = _ranked(state, models, failed, alpha)
     names = {s.model.name for s in scored}
+    if len(residual.affine) > REFINING_SAMPLES:
+        scored = _scored_on_all(state, scored, failed)
     looked_at = _shortlist(scored, lambda s: s.white, len(names)) + _shortlist(scored, lambda s: s.coloured, len(names))
     assessed: dict[tuple[str, str], Assessed] = {}
     for each in looked_at:
@@ -168,6 +160,32 @@ def candidates_of(state: State, models: Sequence[Component], failed: dict[str, s
         for (model, tried, terms, assessment), p, null_p in zip(found, adjusted, null, strict=True)
     ]
     return sorted(candidates, key=lambda c: -c.assessment.gain.total)
+
+
+def _ranked(state: State, models: Sequence[Component], failed: dict[str, str], alpha: float) -> list[_Screened]:
+    """Every model with its best settings and what it explains, of a long survey on a part of the samples."""
+    few, more = _Thinned.of(state, SCREENING_SAMPLES), _Thinned.of(state, REFINING_SAMPLES)
+    scored = []
+    for model in models:
+        for settings, tried in _best_settings(model, state, few, failed, alpha / max(len(models), 1)):
+            terms = more.terms(model, settings, failed)
+            if terms is not None and terms.count:
+                scored.append(_Screened(model, settings, tried, more.white(terms), more.coloured(terms)))
+    return scored
+
+
+def _scored_on_all(state: State, scored: Sequence[_Screened], failed: dict[str, str]) -> list[_Screened]:
+    """Those that explain most, as they do on all samples."""
+    residual = state.residual
+    white, coloured = Scorer(residual, state.terms, WHITE), Scorer(residual, state.terms, state.colours)
+    first = [sorted(scored, key=key, reverse=True)[:SCREENED] for key in (lambda s: s.white, lambda s: s.coloured)]
+    found = []
+    for each in (s for s in scored if any(s in some for some in first)):
+        terms = _terms(each.model, each.settings, state.excitation, failed)
+        assert terms is not None
+        terms = terms.at(residual.samples)
+        found.append(replace(each, white=white(terms), coloured=coloured(terms)))
+    return found
 
 
 def _holm(values: Sequence[float], models: int) -> list[float]:
@@ -213,9 +231,10 @@ class _Thinned:
     coloured: Scorer
 
     @classmethod
-    def of(cls, state: State) -> _Thinned:
-        residual, given = _thinned(state, SCREENING_SAMPLES)
-        colours, x = colours_of(residual), state.excitation
+    def of(cls, state: State, most: int) -> _Thinned:
+        residual, given = _thinned(state, most)
+        colours = state.colours if residual is state.residual else colours_of(residual)
+        x = state.excitation
         scorers = Scorer(residual, given, WHITE), Scorer(residual, given, colours)
         return cls(residual, x, x.at(residual.samples), np.linalg.qr(residual.affine)[0], *scorers)
 
