@@ -138,7 +138,20 @@ def test_a_poor_attitude_does_not_attenuate_the_matrix() -> None:
     assert np.abs(np.mean(found, axis=0)).max() < 2e-5
 
 
+@pytest.mark.parametrize("postures", [8, 12])
+def test_as_few_postures_as_determine_a_matrix_and_an_offset(postures: int) -> None:
+    """A known direction tells three values of each posture, so that fewer do than nine."""
+    found = [errors(surveys(seed, Case(samples=(postures,), attitude_deg=0.05, apart_nT=0.0))) for seed in range(60)]
+    require_as_stated(found)
+
+
 def test_refusals() -> None:
+    few = surveys(4, Case(samples=(7,), attitude_deg=0.05, apart_nT=0.0))
+    with pytest.raises(NotEnoughData, match="5 attitudes and 8 samples are the least"):
+        fit_surveys(few.samples, common_offsets=True)
+    one = surveys(4, Case(samples=(11,), attitude_deg=0.05, apart_nT=0.0, sensors=1))
+    with pytest.raises(NotEnoughData, match="12 samples are the least"):
+        fit_surveys(one.samples, common_offsets=True)
     truth = surveys(3, Case(samples=(200,), attitude_deg=0.1))
     assert truth.samples.direction is not None
     with pytest.raises(DataError, match="mirror"):

@@ -43,6 +43,7 @@ from .postures import Further, attitude_design, further_postures, further_togeth
 from .quadric import NotAnEllipsoid, ellipsoid_of, fit_ellipsoid, gradient_normalised, nearest_quadrics
 from .types import Array
 
+LEAST_ATTITUDES = 9
 LEAST_SAMPLES = 10  # nine parameters and one sample to judge them by
 FALSE_ALARM = 1e-3  # probability that noise alone passes for a second, distinct quadric
 LEAST_RATIO = 10.0
@@ -84,6 +85,7 @@ class Coverage:
         unseen: half axes ("+x" ... "-z") that the field never came near.
         still: axes whose output never changed by more than 0.1 % of F.
         further: the postures that would help most; none where the attitudes are spread well.
+        least_samples, least_attitudes: fewer are refused unseen.
     """
 
     samples: int
@@ -98,15 +100,17 @@ class Coverage:
     unseen: tuple[str, ...]
     still: tuple[str, ...]
     further: Further
+    least_samples: int = LEAST_SAMPLES
+    least_attitudes: int = LEAST_ATTITUDES
 
     @property
     def faults(self) -> tuple[str, ...]:
         """Why the nine parameters are not determined; empty where they are."""
         found = []
-        if self.samples < LEAST_SAMPLES or self.distinct < 9:
+        if self.samples < self.least_samples or self.distinct < self.least_attitudes:
             found.append(
                 f"{self.samples} samples in {self.distinct} distinct attitudes, "
-                f"where nine attitudes and {LEAST_SAMPLES} samples are the least"
+                f"where {self.least_attitudes} attitudes and {self.least_samples} samples are the least"
             )
         elif self.second_distance <= self.required_distance:
             found.append(
@@ -257,7 +261,7 @@ def require_coverage(found: Coverage) -> None:
     """
     if found.determined:
         return
-    if found.scattered and found.distinct >= 9:
+    if found.scattered and found.distinct >= found.least_attitudes:
         raise NotEnoughData(
             f"{'; '.join(found.faults)}, so they determine no scale factors, angles and offsets",
             hint="look for spikes, stuck or saturated values, the wrong reference, or a moving magnetic object",

@@ -239,7 +239,8 @@ def fitted(
     offset = means + (found.centres @ plane.basis.T * plane.noise).reshape(means.shape)
     from .judged import judged
 
-    return SurveysFit(forward, offset, plane, data, found, keep, judged(data, found, worst_error), std, wider)
+    seen = judged(data, found, worst_error, len(forward))
+    return SurveysFit(forward, offset, plane, data, found, keep, seen, std, wider)
 
 
 def _sighted(data: InPlane, direction: Array, known_std: float | None) -> tuple[InPlane, Found, float, float]:

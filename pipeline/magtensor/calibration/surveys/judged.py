@@ -19,11 +19,14 @@ from magtensor.calibration.types import Array
 
 from .sums import SYMMETRIC, Found, InPlane
 
+LEAST_SIGHTED = 8  # samples of known direction: the attitude's own error is found from what they leave,
+LEAST_SIGHTED_ALONE = 12  # and the sensor's noise too where no neighbour tells it
+LEAST_ATTITUDES_SIGHTED = 5  # four determine a matrix and an offset
 _PICKED = 20_000  # samples that the words are found from
 
 
-def judged(data: InPlane, found: Found, worst_error: float) -> Coverage:
-    """What the attitudes determine, in the plane's own axes turned as the fit has turned them."""
+def judged(data: InPlane, found: Found, worst_error: float, sensors: int) -> Coverage:
+    """What the attitudes of so many sensors determine, in the plane's own axes turned as the fit has turned them."""
     b, total_field = data.fields(found.matrix, found.centres), found.sums.total_field
     some = slice(None, None, max(1, len(b) // _PICKED))
     seen = coverage(
@@ -31,6 +34,9 @@ def judged(data: InPlane, found: Found, worst_error: float) -> Coverage:
     )
     second, required = (np.inf, 0.0) if data.sighting is not None else _second_distance(data, b, total_field)
     worst = _worst_error(data, found, float(np.mean(total_field)))
+    if data.sighting is not None:
+        least = LEAST_SIGHTED if sensors > 1 else LEAST_SIGHTED_ALONE
+        seen = replace(seen, least_samples=least, least_attitudes=LEAST_ATTITUDES_SIGHTED)
     return replace(seen, second_distance=second, required_distance=required, worst_error=worst)
 
 
@@ -66,7 +72,9 @@ def _worst_error(data: InPlane, found: Found, field: float) -> float:
     from scipy.special import chdtri
 
     sums, free = found.sums, data.free
-    freedom = len(data.y) - len(sums.gradient) - max(data.level.max() if data.level is not None else 0, 0)
+    parameters = len(sums.gradient) + max(data.level.max() if data.level is not None else 0, 0)
+    # with a known direction a sample tells three values, of which that along the field has its share of the parameters
+    freedom = len(data.y) - (parameters if data.sighting is None else parameters / 3.0)
     if freedom < 1:
         return float("inf")
     # an attitude's standard deviation was found from what it leaves; that of the rest is in what the rest leaves
