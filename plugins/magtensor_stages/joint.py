@@ -203,11 +203,7 @@ def calibrate_joint(
         )
     chosen, effects = dict(error_models), None
     extra: dict[str, Any] = {}
-    plain = field.measured and not field.vector and not several
-    if chosen and plain:
-        effects, doubted = joint_effects.of_one_survey(survey, chosen, reference_noise_nT, robust, worst_error)
-        calibration = effects.found.calibration
-    elif chosen or several or field.vector or field.kind.startswith("per_"):
+    if chosen or several or field.vector or field.kind.startswith("per_"):
         how = (reference_noise_nT, attitude_std_deg, robust, worst_error)
         if "linear" in (matrices, offsets):
             calibration, extra, doubted = changing_with_date(survey, field, how, matrices, offsets, offset_of == "mean")

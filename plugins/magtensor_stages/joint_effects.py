@@ -1,4 +1,4 @@
-"""Declared effects beside C and o: of one survey with a measured total field, and of whatever else is fitted."""
+"""Declared effects beside C and o, from surveys to what was fitted and to a survey's variables."""
 
 from __future__ import annotations
 
@@ -8,10 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from magtensor import DataError, NotEnoughData
+from magtensor import DataError
 from magtensor.components import Component
 from magtensor_stages import joint_surveys
-from magtensor_stages.sensors import naming
 
 if TYPE_CHECKING:
     from magtensor.calibration.surveys.samples import Samples
@@ -54,29 +53,6 @@ class Effects:
         from magtensor.loop.stored import cleaned
 
         return cleaned(survey, self.found.calibration, self.adopted, self.theta, self.means)
-
-
-def of_one_survey(
-    survey: Survey, chosen: Chosen, reference_noise: float, robust: bool, worst_error: float
-) -> tuple[Effects, np.ndarray]:
-    """The effects of a survey with a measured total field, and its samples (N,) that no noise explains."""
-    from magtensor.effect_errors import with_coefficients
-    from magtensor.loop.model import Adopted, Fitting, joint_state, require_determined, with_colour
-    from magtensor.loop.record import record_of
-
-    record, where = record_of(survey), str(survey.attributes.get("source", ""))
-    if not len(record.time):
-        raise NotEnoughData("no sample has all sensors in use and a total field", where=where)
-    adopted = [Adopted(component, settings) for component, settings in chosen.values()]
-    _require_needs(adopted, record, where)
-    how = Fitting(reference_noise, worst_error, searching=False)
-    with naming(survey):
-        state = joint_state(record, adopted, how, keep=None if robust else np.ones(len(record.time), dtype=bool))
-        require_determined(record, state, how)
-    doubted = np.zeros(len(survey.time), dtype=bool)
-    doubted[record.samples[~state.fit.keep]] = True
-    found = with_coefficients(with_colour(record, state, how))
-    return Effects(adopted, state.theta, record.means, found), doubted
 
 
 def surveys_fitted(

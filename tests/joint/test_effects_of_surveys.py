@@ -158,3 +158,20 @@ def test_mistakes(
     path = recipe(tmp_path, survey, f"detrend_diurnal, calibrate_joint: {joint}")
     assert status_of(["run", str(path), "--output", str(tmp_path / "out")]) == status
     assert said in capsys.readouterr().err
+
+
+def test_a_jump_is_one_of_the_time_in_all_surveys(tmp_path: Path) -> None:
+    """In the second survey the first one's jump has happened: with common offsets both tell of it."""
+    bench = Bench(3)
+    jump = 30.0 * bench.rng.standard_normal((4, 3))
+    bench.per_degree = jump
+    bench.written(tmp_path / "a.h5", 20.0 + 1.0 * (np.arange(SAMPLES) >= 390), reference=True)
+    bench.written(tmp_path / "b.h5", np.full(SAMPLES, 21.0), reference=True, date="2026-02-01")
+    step = "error_models: {offset_step: {time_s: 389.5}}"
+    stds = []
+    for survey, joint in ((", with: b.h5", f"{{{step}, offsets: common}}"), ("", f"{{{step}}}")):
+        done = computed(recipe(tmp_path, survey, f"detrend_diurnal, calibrate_joint: {joint}"))
+        values = done["calibration/joint_parameter"].attrs["value_of_coefficients"][48:]
+        stds.append(np.sqrt(np.diag(done.values(COVARIANCE))[48:]))
+        assert np.abs((values - jump.ravel()) / stds[-1]).max() < 4.5
+    assert (stds[0] < 0.8 * stds[1]).all()  # alone, ten samples tell of it

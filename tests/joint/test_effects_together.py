@@ -120,6 +120,44 @@ def test_slope_of_c_and_offsets_is_that_of_refits(case: Case) -> None:
         assert wrong.max() < 0.02 * np.abs(numeric / scale).max()
 
 
+def test_a_strong_effect_beside_unknown_constants() -> None:
+    """Forty times the noise at first: a scale of the field, which is free, must not pass for what the effect leaves."""
+    of = warmed(1, Case(samples=(2000, 2000), tilt_deg=40.0, levels=20), temperature_offset)
+    more = 20.0 * of.theta * of.degrees[:, None, None]
+    of = replace(of, theta=21.0 * of.theta, samples=replace(of.samples, raw=of.samples.raw + more))
+    found = calibrated(of, fitted(of))
+    value, rank = square(parameters(found) - true_parameters(of), joint_covariance(found))
+    assert value / rank == pytest.approx(1.0, abs=0.1 + 4 * np.sqrt(2.0 / rank))
+
+
+def flicker(rng: np.random.Generator, samples: int, rms_nT: float) -> Array:
+    """(N, 4, 3) noise whose power goes with 1 / f, down to half a turn in the survey."""
+    frequency = np.maximum(np.fft.rfftfreq(2 * samples), 0.5 / samples)
+    size = (len(frequency), 12)
+    spectrum = (rng.standard_normal(size) + 1j * rng.standard_normal(size)) / np.sqrt(frequency)[:, None]
+    noise = np.fft.irfft(spectrum, axis=0)[:samples]
+    return (rms_nT * noise / noise.std(axis=0)).reshape(-1, 4, 3)
+
+
+def test_slow_noise_is_in_the_coefficients_errors() -> None:
+    """A temperature as slow as the noise takes some of it away, which the rest of the spectrum must replace."""
+    squares, against_white = [], []
+    case = Case(samples=(1000, 700), tilt_deg=40.0)
+    quiet = warmed(0, case, temperature_offset)
+    white = np.diag(calibrated(quiet, fitted(quiet)).theta)
+    for seed in range(8):
+        of = warmed(seed, case, temperature_offset)
+        rng = np.random.default_rng(seed)
+        slow = np.concatenate([flicker(rng, count, 0.5) for count in of.truth.case.samples])
+        found = calibrated(of, fitted(replace(of, samples=replace(of.samples, raw=of.samples.raw + slow))))
+        error = found.values - of.theta.ravel()
+        squares.append(np.mean(error**2 / np.diag(found.theta)))
+        against_white.append(np.mean(error**2 / white))
+    # twelve coefficients a fit, the noise of an axis its own
+    assert np.mean(squares) == pytest.approx(1.0, abs=0.2 + 3.5 * np.sqrt(2.0 / (8 * 12)))
+    assert np.mean(against_white) > 4.0
+
+
 def test_coefficients_that_no_data_show_stay_zero() -> None:
     """A temperature that is constant in each survey is an offset of that survey."""
     of = warmed(2, Case(samples=(200, 200)), temperature_offset)

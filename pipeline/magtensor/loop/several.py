@@ -1,9 +1,10 @@
-"""Error models beside C and o in a fit of several surveys, of an unknown total field, or with known directions.
+"""Declared error models beside C and o of one survey or several, with what is known of the field.
 
-As `model.joint_state` for one survey with a measured total field: for given coefficients C, o and the constants are the
-fit of outputs and total field with the effects taken off (`calibration.surveys`); the coefficients then move by a step
-in which all of these are free. Coefficients are common to all surveys, whose residuals, put after each other, are one
-series: its noise has one colour.
+As `model.joint_state`, which the search uses: for given coefficients C, o and the unknown constants of the field are
+the fit of outputs and total field with the effects taken off (`calibration.surveys`); the coefficients then move by a
+step in which all of these are free. Coefficients are common to all surveys, whose residuals, put after each other, are
+one series: its noise has one colour, whose slow part follows from its middle frequencies, as what the coefficients took
+away there is not to be missed.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import numpy as np
 from magtensor.calibration.common_scale import nominal
 from magtensor.calibration.maximum_likelihood import along
 from magtensor.calibration.surveys.directions import across
-from magtensor.calibration.surveys.fit import SurveysFit, fit_surveys, frame_of
+from magtensor.calibration.surveys.fit import SurveysFit, fit_surveys, frame_of, whitened
 from magtensor.calibration.surveys.samples import Samples
 from magtensor.calibration.types import Array
 from magtensor.errors import DataError
@@ -26,6 +27,7 @@ from magtensor.loop.excitation import Excitation
 from magtensor.loop.model import MOST_ROUNDS, SETTLED, Adopted, Record, share_of
 from magtensor.loop.residual import Levels, Residual, Sighted
 from magtensor.loop.statistics import Estimate
+from magtensor.loop.stretches import borne_out_in
 from magtensor.loop.terms import Terms, joined, stacked
 from magtensor.loop.turned import SlowModes, TurnedColour
 
@@ -75,24 +77,44 @@ def surveys_state(of: Together) -> SurveysState:
     NotEnoughData, DataError: as in `fit_surveys`; an error model whose coefficients are others on another survey.
     """
     samples, theta = of.samples, np.zeros(0)
-    for _ in range(MOST_ROUNDS):
-        fit = fit_surveys(samples, **of.options, complete=False)
+    lasting = True
+    for _ in range(2 * MOST_ROUNDS):
+        fit, more = _fitted(of, samples, lasting)
         each = _terms(of, samples, fit)
         residual = residual_of_surveys(fit, samples)
         terms = joined(each).at(residual.samples)
-        colours = colours_of(residual)
+        colours = colours_of(residual, stiff=True)
         estimate = estimated(residual, terms, _beside_what_is_free(colours, residual, terms.count))
         before = theta if len(theta) else np.zeros(terms.count)
         share = share_of(residual, terms, estimate.theta, colours)
         theta = estimate.seen(before) + share * estimate.theta  # what no data show stays zero
         samples = _without(of.samples, joined(each), theta)
         if np.max(np.abs(theta - before) / np.sqrt(np.maximum(np.diag(estimate.covariance), 1e-300))) < SETTLED:
-            break
+            if not more:
+                break
+            lasting = False
     fit = fit_surveys(samples, **of.options)
     residual = residual_of_surveys(fit, samples)
     terms = joined(_terms(of, samples, fit)).at(residual.samples)
     parts = tuple(np.split(theta, np.cumsum([e.count for e in each])[:-1]))
     return SurveysState(tuple(of.adopted[0]), parts, fit, samples, residual, terms, estimate)
+
+
+def _fitted(of: Together, samples: Samples, lasting: bool) -> tuple[SurveysFit, bool]:
+    """The fit of samples whose effects may not be all taken off yet, and whether it believes samples for it.
+
+    Parameters
+    ----------
+    lasting: what noise does not explain is believed where it lasts (`stretches`): an effect of which the coefficients
+        are not known yet, such as a jump shortly before the end.
+    """
+    fit = fit_surveys(samples, **of.options, complete=False)
+    if not lasting or fit.keep.all():
+        return fit, False
+    keep = borne_out_in(fit.keep, [(freedom, np.nan_to_num(part)) for freedom, part in whitened(fit, samples)])
+    if np.array_equal(keep, fit.keep):
+        return fit, False
+    return fit_surveys(samples, **of.options, complete=False, keep=keep), True
 
 
 def residual_of_surveys(fit: SurveysFit, samples: Samples) -> Residual:
@@ -109,7 +131,9 @@ def residual_of_surveys(fit: SurveysFit, samples: Samples) -> Residual:
     unit = float(seen.length.mean())
     affine = np.column_stack([b / unit, np.eye(data.centres)[data.centre]])
     response = (seen.unit * seen.inverse_std).T @ matrix
-    inner = np.einsum("ni,nj->nij", response, affine).reshape(len(b), -1)
+    # at the foot points: beside unknown constants a change of scale would otherwise be the residual itself
+    foot = np.column_stack([(seen.unit * total_field).T / unit, affine[:, 3:]])
+    inner = np.einsum("ni,nj->nij", response, foot).reshape(len(b), -1)
     levels = None if data.level is None else Levels(data.level, -seen.inverse_std)
     sighted = None
     if data.sighting is not None:

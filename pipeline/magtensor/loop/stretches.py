@@ -9,6 +9,7 @@ it lasts longer than a held-out fold: other folds can confirm it then.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -30,24 +31,32 @@ def borne_out(fit: JointFit, raw: Array, total_field: Array, reference_noise: fl
     ----------
     raw: (N, S, 3) nT and total_field: (N,) nT, those the fit was made from.
     """
+    every = residual_of(replace(fit, keep=np.ones_like(fit.keep)), raw, total_field, reference_noise)
+    given = [(every.freedom - 1, every.across), (1, every.along)]
+    return borne_out_in(fit.keep, [(freedom, p.reshape(len(raw), -1)) for freedom, p in given if p is not None])
+
+
+def borne_out_in(keep: Mask, parts: Sequence[tuple[int, Array]]) -> Mask:
+    """The same of a fit that keeps some of its samples (N,).
+
+    Parameters
+    ----------
+    parts: whitened residuals (N, Q) of all samples, and how many independent values a sample has in each.
+    """
     from scipy.ndimage import median_filter
     from scipy.special import chdtri
 
-    doubted = np.flatnonzero(~fit.keep)
-    every = residual_of(replace(fit, keep=np.ones_like(fit.keep)), raw, total_field, reference_noise)
-    good = np.ones(len(raw), dtype=bool)
-    given = [(every.across, every.freedom - 1), (every.along, 1)]
-    parts = [(p.reshape(len(raw), -1), freedom) for p, freedom in given if p is not None]
-    for values, freedom in parts:
+    count = len(keep)
+    good = np.ones(count, dtype=bool)
+    for freedom, values in parts:
         apart = values - median_filter(values, size=(NEIGHBOURS, 1), mode="nearest")
         square = np.sum(apart**2, axis=1)
-        limit = chdtri(freedom, FALSE_REJECTION / (len(raw) * len(parts))) / chdtri(freedom, 0.5)
+        limit = chdtri(freedom, FALSE_REJECTION / (count * len(parts))) / chdtri(freedom, 0.5)
         good &= square <= limit * np.median(square)
-    out = np.array(fit.keep)
-    out[doubted] = good[doubted]
-    doubtful = median_filter((~fit.keep).astype(int), size=NEIGHBOURS, mode="nearest")
+    out = keep | good
+    doubtful = median_filter((~keep).astype(int), size=NEIGHBOURS, mode="nearest")
     edges = np.flatnonzero(np.diff(doubtful, prepend=0, append=0)).reshape(-1, 2)
     for first, end in edges:
-        if end - first > len(raw) / FOLDS:
+        if end - first > count / FOLDS:
             out[first:end] = True
     return out

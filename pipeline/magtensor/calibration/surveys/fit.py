@@ -87,6 +87,7 @@ def fit_surveys(
     worst_error: float = WORST_ERROR,
     mean_field: float | None = None,
     complete: bool = True,
+    keep: Mask | None = None,
 ) -> SurveysFit:
     """Fit C of all sensors and their offsets to several surveys.
 
@@ -102,6 +103,7 @@ def fit_surveys(
     mean_field: nT, the mean over the samples of a total field that is an unknown constant of some of them.
     complete: the model holds all there is. Where it does not, what an effect without a model leaves must not pass for
         a lack of attitudes or a broken sensor: neither is asked for, nor what each survey says.
+    keep: (N,) samples to believe; judged here when None.
 
     Raises
     ------
@@ -111,9 +113,9 @@ def fit_surveys(
     require_usable(samples)
     _require_turned_within_levels(samples)
     sensors, count = samples.raw.shape[1], len(samples.raw)
-    judge = robust and count >= LEAST_FOR_REJECTION
+    judge = robust and keep is None and count >= LEAST_FOR_REJECTION
     own_noise = noise is None and sensors > 1 and count >= LEAST_FOR_REJECTION
-    keep = np.ones(count, dtype=bool)
+    keep = np.ones(count, dtype=bool) if keep is None else keep
     given = output_noise(samples.raw, keep, samples.run) if own_noise else noise
     told = 2 if sensors == 2 and own_noise else 0
     one = sensors == 1 and noise is None
@@ -299,6 +301,21 @@ def _believed(fit: SurveysFit, samples: Samples) -> Mask:
     """(N,) samples whose squared residuals noise explains."""
     from scipy.special import chdtri
 
+    parts = whitened(fit, samples)
+    good = np.ones(len(samples.raw), dtype=bool)
+    for freedom, residual in parts:
+        values = np.sum(residual**2, axis=1)
+        level = FALSE_REJECTION / (len(values) * len(parts))
+        typical = max(float(np.median(values[np.isfinite(values)])) / float(chdtri(freedom, 0.5)), 1e-300)
+        good &= ~(values > float(chdtri(freedom, level)) * typical)
+    return good
+
+
+def whitened(fit: SurveysFit, samples: Samples) -> list[tuple[int, Array]]:
+    """The whitened residuals (N, Q) of all samples of a fit, left out or not, along the field, across the plane and
+    across known directions, and how many independent values a sample has in each. NaN where the total field is an
+    unknown constant of samples that were all left out.
+    """
     centre = np.zeros(len(samples.raw), dtype=int) if len(fit.offset) == 1 else samples.survey
     white = (samples.raw - fit.offset[centre]).reshape(len(samples.raw), -1) / fit.plane.noise
     y = white @ fit.plane.basis
@@ -308,20 +325,15 @@ def _believed(fit: SurveysFit, samples: Samples) -> Mask:
         known[samples.level[fit.keep]] = fit.found.sums.total_field
         total_field = np.where(known[samples.level] > 0, known[samples.level], np.nan)
     seen = along(fit.found.matrix, np.zeros(3), y.T, total_field, fit.data.reference_noise)
-    squares = [(1, seen.residual**2)]
+    parts = [(1, seen.residual[:, None])]
     if white.shape[1] > 3:
-        squares.append((white.shape[1] - 3, np.sum((white - y @ fit.plane.basis.T) ** 2, axis=1)))
+        parts.append((white.shape[1] - 3, white - y @ fit.plane.basis.T))
     if samples.direction is not None and fit.attitude_std is not None:
         b = (seen.unit * seen.length).T
         view = sighting(fit.found.matrix, b, samples.direction, fit.attitude_std, fit.data.reference_noise)
         side = across(view, slice(None), b, seen.length - total_field)
-        squares.append((2, np.sum(side.residual**2, axis=1)))
-    good = np.ones(len(y), dtype=bool)
-    for freedom, values in squares:
-        level = FALSE_REJECTION / (len(y) * len(squares))
-        typical = max(float(np.median(values[np.isfinite(values)])) / float(chdtri(freedom, 0.5)), 1e-300)
-        good &= ~(values > float(chdtri(freedom, level)) * typical)
-    return good
+        parts.append((2, side.residual))
+    return parts
 
 
 def _refuse(fit: SurveysFit, used: Samples) -> None:
