@@ -1,8 +1,8 @@
 """The joint fit without a reference, of several surveys, and with an attitude, against the bound that noise sets.
 
 `python studies/joint_surveys.py` prints the tables of docs/joint_surveys.md. Surveys are those of
-tests/joint/several_cases.py and changing_cases.py (the array of METHODS A4.8, 1 nT of noise, without the product's
-simulator). The first column of figures, error over bound, is the rms error of all parameters of all surveys, measured
+tests/joint/several_cases.py, changing_cases.py and effects_cases.py (the array of METHODS A4.8, 1 nT of noise, without
+the product's simulator). The first column of figures, error over bound, is the rms error of all parameters of all surveys, measured
 by the Cramer-Rao information and over the number of determined parameters: 1 at the bound. The information is computed
 there from the true parameters, sample by sample, with the unknown direction of each field projected off, and its size
 where that is an unknown constant. Behind it stands its standard error. Standardised errors are over the standard
@@ -21,8 +21,11 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests/joint"))
 
 import changing_cases
+import effects_cases
 import several_cases
 from several_cases import Case
+
+from magtensor_effects.temperature import temperature_offset, temperature_scale
 
 CASES: dict[str, Sequence[tuple[str, Case | changing_cases.Case]]] = {
     "Without a scalar reference": [
@@ -109,6 +112,57 @@ def later_table(runs: int) -> None:
     print()
 
 
+EFFECTS = "With declared effects"
+EFFECTS_CASES = [
+    ("300 + 200, own offsets, offsets follow", Case(samples=(300, 200), tilt_deg=40.0), temperature_offset, 0.0),
+    ("300 + 200, common offsets, scale factors follow", Case(samples=(300, 200), tilt_deg=40.0, apart_nT=0.0),
+     temperature_scale, 0.0),
+    ("5 x 12 postures, +-60 deg, own offsets, offsets follow", Case(samples=(12,) * 5, tilt_deg=60.0),
+     temperature_offset, 0.0),
+    ("1 sensor, 300 + 300, +-60 deg, own offsets, offsets follow", Case(samples=(300, 300), sensors=1, tilt_deg=60.0),
+     temperature_offset, 0.0),
+    ("300 + 200, +-60 deg, 2 x 3 unknown constants, offsets follow", Case(samples=(300, 200), levels=3, tilt_deg=60.0),
+     temperature_offset, 0.0),
+    ("400, attitude to 0.3 deg, offsets follow", Case(samples=(400,), tilt_deg=40.0, attitude_deg=0.3),
+     temperature_offset, 0.0),
+    ("200 + 200, attitude to 0.05 deg, scale factors follow",
+     Case(samples=(200, 200), tilt_deg=40.0, attitude_deg=0.05), temperature_scale, 0.0),
+    ("3000, offsets follow, slow noise", Case(samples=(3000,), tilt_deg=40.0), temperature_offset, 0.5),
+    ("2000 + 1500, own offsets, offsets follow, slow noise", Case(samples=(2000, 1500), tilt_deg=40.0),
+     temperature_offset, 0.5),
+    ("2000 + 1500, 2 x 2 unknown constants, offsets follow, slow noise",
+     Case(samples=(2000, 1500), levels=2, tilt_deg=40.0), temperature_offset, 0.5),
+    ("3000, attitude to 0.2 deg, offsets follow, slow noise", Case(samples=(3000,), tilt_deg=40.0, attitude_deg=0.2),
+     temperature_offset, 0.5),
+]  # fmt: skip
+
+
+def effects_table(runs: int) -> None:
+    """Print the table of fits with error models."""
+    print(f"## {EFFECTS}\n")
+    print(
+        "| case | fits | variance of standardised errors of C, o | of coefficients | inside 95 % | Mahalanobis / rank |"
+    )
+    print("|---|---|---|---|---|---|", flush=True)
+    for words, case, model, slow_nT in EFFECTS_CASES:
+        pooled, coefficients, squares = [], [], []
+        for seed in range(runs):
+            of = effects_cases.warmed(seed, case, model)
+            of = effects_cases.with_slow_noise(of, seed, slow_nT) if slow_nT else of
+            found = effects_cases.calibrated(of, effects_cases.fitted(of))
+            error = effects_cases.parameters(found) - effects_cases.true_parameters(of)
+            covariance = effects_cases.joint_covariance(found)
+            z = error / np.sqrt(np.diag(covariance))
+            pooled.append(z[: -len(found.values)])
+            coefficients.append(z[-len(found.values) :])
+            square, rank = effects_cases.square(error, covariance)
+            squares.append(square / rank)
+        told = [f"{np.mean(np.square(part)):.3f}" for part in (pooled, coefficients)]
+        inside = f"{100 * np.mean(np.abs(np.concatenate([*pooled, *coefficients])) < 1.96):.1f} %"
+        print(f"| {words} | {runs} | {' | '.join(told)} | {inside} | {np.mean(squares):.3f} |", flush=True)
+    print()
+
+
 def errors_of(seed: int, case: Case | changing_cases.Case) -> several_cases.Errors:
     """Of one draw."""
     if isinstance(case, changing_cases.Case):
@@ -139,13 +193,15 @@ def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--runs", type=int, default=200)
-    parser.add_argument("--table", choices=[*CASES, LATER], help="one of them alone")
+    parser.add_argument("--table", choices=[*CASES, LATER, EFFECTS], help="one of them alone")
     chosen = parser.parse_args()
     for name, cases in CASES.items():
         if chosen.table in (None, name):
             table(name, cases, chosen.runs)
     if chosen.table in (None, LATER):
         later_table(chosen.runs)
+    if chosen.table in (None, EFFECTS):
+        effects_table(chosen.runs)
 
 
 if __name__ == "__main__":

@@ -59,6 +59,19 @@ def warmed(seed: int, case: Case, model: Model) -> Warmed:
     return Warmed(truth, replace(truth.samples, raw=truth.samples.raw + effect), degrees, theta, model)
 
 
+def with_slow_noise(of: Warmed, seed: int, rms_nT: float) -> Warmed:
+    """The surveys with noise whose power goes with 1 / f, down to half a turn in each survey."""
+    rng, parts = np.random.default_rng(seed + 80_000), []
+    for count in of.truth.case.samples:
+        frequency = np.maximum(np.fft.rfftfreq(2 * count), 0.5 / count)
+        size = (len(frequency), of.samples.raw[0].size)
+        spectrum = (rng.standard_normal(size) + 1j * rng.standard_normal(size)) / np.sqrt(frequency)[:, None]
+        noise = np.fft.irfft(spectrum, axis=0)[:count]
+        parts.append(rms_nT * noise / noise.std(axis=0))
+    raw = of.samples.raw + np.concatenate(parts).reshape(of.samples.raw.shape)
+    return replace(of, samples=replace(of.samples, raw=raw))
+
+
 def records(of: Warmed) -> list[Record]:
     """Of each survey, with its thermometer."""
     found = []

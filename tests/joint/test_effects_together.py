@@ -16,6 +16,7 @@ from effects_cases import (
     square,
     true_parameters,
     warmed,
+    with_slow_noise,
 )
 from joint_cases import Array
 from several_cases import Case
@@ -130,15 +131,6 @@ def test_a_strong_effect_beside_unknown_constants() -> None:
     assert value / rank == pytest.approx(1.0, abs=0.1 + 4 * np.sqrt(2.0 / rank))
 
 
-def flicker(rng: np.random.Generator, samples: int, rms_nT: float) -> Array:
-    """(N, 4, 3) noise whose power goes with 1 / f, down to half a turn in the survey."""
-    frequency = np.maximum(np.fft.rfftfreq(2 * samples), 0.5 / samples)
-    size = (len(frequency), 12)
-    spectrum = (rng.standard_normal(size) + 1j * rng.standard_normal(size)) / np.sqrt(frequency)[:, None]
-    noise = np.fft.irfft(spectrum, axis=0)[:samples]
-    return (rms_nT * noise / noise.std(axis=0)).reshape(-1, 4, 3)
-
-
 def test_slow_noise_is_in_the_coefficients_errors() -> None:
     """A temperature as slow as the noise takes some of it away, which the rest of the spectrum must replace."""
     squares, against_white = [], []
@@ -147,9 +139,7 @@ def test_slow_noise_is_in_the_coefficients_errors() -> None:
     white = np.diag(calibrated(quiet, fitted(quiet)).theta)
     for seed in range(8):
         of = warmed(seed, case, temperature_offset)
-        rng = np.random.default_rng(seed)
-        slow = np.concatenate([flicker(rng, count, 0.5) for count in of.truth.case.samples])
-        found = calibrated(of, fitted(replace(of, samples=replace(of.samples, raw=of.samples.raw + slow))))
+        found = calibrated(of, fitted(with_slow_noise(of, seed, 0.5)))
         error = found.values - of.theta.ravel()
         squares.append(np.mean(error**2 / np.diag(found.theta)))
         against_white.append(np.mean(error**2 / white))
