@@ -2,11 +2,11 @@
 
 `python studies/joint_surveys.py` prints the tables of docs/joint_surveys.md. Surveys are those of
 tests/joint/several_cases.py, changing_cases.py and effects_cases.py (the array of METHODS A4.8, 1 nT of noise, without
-the product's simulator). The first column of figures, error over bound, is the rms error of all parameters of all surveys, measured
-by the Cramer-Rao information and over the number of determined parameters: 1 at the bound. The information is computed
-there from the true parameters, sample by sample, with the unknown direction of each field projected off, and its size
-where that is an unknown constant. Behind it stands its standard error. Standardised errors are over the standard
-deviations that the fit states, all parameters pooled.
+the product's simulator). The first column of figures, error over bound, is the rms error of all parameters of all
+surveys, measured by the Cramer-Rao information and over the number of determined parameters: 1 at the bound. The
+information is computed there from the true parameters, sample by sample, with the unknown direction of each field
+projected off, and its size where that is an unknown constant. Behind it stands its standard error. Standardised
+errors are over the standard deviations that the fit states, all parameters pooled.
 """
 
 from __future__ import annotations
