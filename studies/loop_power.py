@@ -75,6 +75,7 @@ RIGHT: dict[str, dict[str, Any]] = {
     "periodic_interference": {"frequency_Hz": 49.7},
     "channel_response": {"channel": "pressure", "power": 2, "lag_s": 3.0},
     "reference_step": {"time_s": 700.0},
+    "reference_drift": {"order": 3},
     "passing_source": {"time_s": 900.0, "passage_s": 24.0},
 }
 
@@ -135,7 +136,7 @@ def oracle(trial: Trial, simulation: Simulated, record: Record, state: State) ->
     if trial.effect in ("", "latent_source") or "+" in trial.effect:
         return None
     settings = dict(RIGHT.get(trial.effect, {}))
-    if trial.effect in ("offset_drift", "scale_drift"):
+    if trial.effect in ("offset_drift", "reference_drift", "scale_drift"):
         settings["span_s"] = float(np.ptp(record.time))
     if trial.effect == "reference_clock":
         settings["lag_s"] = float(np.ravel(next(iter(simulation.truth.effects[0].coefficients.values())))[0])

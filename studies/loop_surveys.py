@@ -82,6 +82,7 @@ EFFECTS: dict[str, dict[str, Any]] = {
     "site_gradient": {},
     "reference_scale": {},
     "reference_clock": {},
+    "reference_drift": {"settles_s": 900.0},
     "reference_step": {"time_s": [700.0]},
     "passing_source": {"time_s": 900.0, "closest_m": [12.0, 0.0, 0.0], "velocity_m_s": [0.0, 0.5, 0.0]},
 }
@@ -92,7 +93,7 @@ FAMILIES = (
     ("hysteresis", "sampling_lag", "eddy_current", "bandwidth", "clock_drift", "viscous_magnetisation"),
     ("current_field", "moving_part", "periodic_interference", "frame_flexure", "channel_response", "latent_source"),
     ("fixed_source", "site_gradient"),
-    ("reference_clock", "reference_step"),
+    ("reference_clock", "reference_drift", "reference_step"),
 )  # those of one family may imitate each other
 STAGES = "title: study\nstages: [load, {detrend_diurnal: {uncovered: mask}}]\n"
 

@@ -7,7 +7,7 @@ from magtensor_effects.inertia import bandwidth, clock_drift, eddy_current, samp
 from magtensor_effects.latent import latent_source
 from magtensor_effects.mechanics import crosstalk, frame_flexure, turn_step
 from magtensor_effects.power import current_field, supply_offset, supply_scale
-from magtensor_effects.reference import reference_clock, reference_scale, reference_step
+from magtensor_effects.reference import reference_clock, reference_drift, reference_scale, reference_step
 from magtensor_effects.site import fixed_source, passing_source, site_gradient
 from magtensor_effects.temperature import temperature_offset, temperature_rate, temperature_scale
 from magtensor_effects.transfer import cross_field, hysteresis, nonlinearity_cubic, nonlinearity_quadratic
@@ -35,6 +35,7 @@ __all__ = [
     "periodic_interference",
     "position_error",
     "reference_clock",
+    "reference_drift",
     "reference_scale",
     "reference_step",
     "sampling_lag",

@@ -21,7 +21,7 @@ Span = Annotated[
 EventTime = Annotated[float, EventTimes(), Field(description="time of the jump, s since the survey's start")]
 
 
-def _courses(x: Excitation, order: int, span_s: float) -> list[Array]:
+def courses(x: Excitation, order: int, span_s: float) -> list[Array]:
     """Legendre polynomials 1 to `order` of time, from -1 at the start to 1 after span_s."""
     u = np.clip(2.0 * x.elapsed / span_s - 1.0, -1.0, 1.0)
     return [np.polynomial.legendre.Legendre.basis(k)(u) for k in range(1, order + 1)]
@@ -35,8 +35,8 @@ def offset_drift(x: Excitation, *, order: Order = 1, span_s: Span = 3600.0) -> T
     One coefficient an axis and order. A drift is not predicted beyond span_s. Rivals: whatever else changes steadily
     with time (`warm_up`, `temperature_offset`); `scale_drift` where the attitude hardly changes.
     """
-    courses = _courses(x, order, span_s)
-    return joined([x.offsets(c, "nT", f"P{k} ") for k, c in enumerate(courses, start=1)])
+    named = enumerate(courses(x, order, span_s), start=1)
+    return joined([x.offsets(c, "nT", f"P{k} ") for k, c in named])
 
 
 @error_model(
@@ -50,8 +50,8 @@ def scale_drift(x: Excitation, *, order: Order = 1, span_s: Span = 3600.0) -> Te
     Legendre polynomials of time over span_s times the axis's own output: the coefficient of P1 is half the change
     from the start to the end. Rivals: `reference_scale` where the total field changes steadily; `temperature_scale`.
     """
-    courses = _courses(x, order, span_s)
-    return joined([x.scales(1e-6 * c, "ppm", f"P{k} ") for k, c in enumerate(courses, start=1)])
+    named = enumerate(courses(x, order, span_s), start=1)
+    return joined([x.scales(1e-6 * c, "ppm", f"P{k} ") for k, c in named])
 
 
 @error_model("instrument", source="exponential settling", typical="a few nT over 15 min")

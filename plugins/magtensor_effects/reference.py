@@ -11,8 +11,8 @@ from magtensor.components import error_model
 from magtensor.errors import DataError
 from magtensor.loop.excitation import Excitation
 from magtensor.loop.settings import Range
-from magtensor.loop.terms import Terms
-from magtensor_effects.ageing import EventTime
+from magtensor.loop.terms import Terms, joined
+from magtensor_effects.ageing import EventTime, Order, Span, courses
 
 NEARBY_S = 2.0  # shorter delays show as the slope over this time
 BETWEEN_NOISE_AND_DELAY = 0.75  # of the lag: half of it is what noise makes, all of it a delay
@@ -76,6 +76,25 @@ def reference_clock(
     earlier, later = x.time - NEARBY_S / 2, x.time + NEARBY_S / 2
     slope = (np.interp(later, x.time, f) - np.interp(earlier, x.time, f)) / NEARBY_S
     return x.on_reference(-slope, "s", "delay")
+
+
+@error_model(
+    "reference",
+    needs=("total_field",),
+    source="drift of the base station",
+    typical="below 1 nT a day for a proton magnetometer, some nT in an hour where its place or its sensor warms up",
+    pointwise=True,
+)
+def reference_drift(x: Excitation, *, order: Order = 1, span_s: Span = 3600.0) -> Terms:
+    """The base station's total field drifts.
+
+    Legendre polynomials of time over span_s: the coefficient of P1 is half the change from the start to the end. Common
+    to all sensors, so the tensor does not feel it. Rival: `scale_drift` with one course for all axes of all sensors,
+    which nothing but another reference would tell from it.
+    """
+    _total_field(x)
+    named = enumerate(courses(x, order, span_s), start=1)
+    return joined([x.on_reference(course, "nT", f"P{k}") for k, course in named])
 
 
 @error_model(

@@ -114,7 +114,7 @@ def passing_source(
     ] = 0.0,
     passage_s: Annotated[
         float,
-        Range(0.005, 0.1, count=3, spacing="log", of_duration=True),
+        Range(0.004, 0.04, count=3, spacing="log", of_duration=True),
         Field(gt=0, description="smallest distance over speed, s"),
     ] = 5.0,
     whole: Annotated[

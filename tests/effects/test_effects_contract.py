@@ -27,7 +27,7 @@ CATALOGUE = {
         "scale_step", "turn_step",
     },
     "site": {"fixed_source", "site_gradient", "passing_source"},
-    "reference": {"reference_scale", "reference_clock", "reference_step"},
+    "reference": {"reference_scale", "reference_clock", "reference_drift", "reference_step"},
 }  # fmt: skip
 
 
@@ -65,6 +65,7 @@ NEEDED = {
     "baseline_expansion": ["position", "gradient", "temperature*"],
     "reference_scale": ["total_field"],
     "reference_clock": ["total_field"],
+    "reference_drift": ["total_field"],
     "reference_step": ["total_field"],
     "latent_source": ["waveform"],
     "sampling_lag": ["rotation"],

@@ -390,6 +390,8 @@ def test_finite_baseline_follows_the_bend_along_the_line() -> None:
         # once a second joined by straight lines
         ("reference_clock", {}, {"offset_s": 0.2}, 0.06, 0.2),
         ("reference_clock", {"lag_s": 8.0}, {"offset_s": 8.0}, 0.03, 8.0),
+        # P1 over three minutes: half of the change
+        ("reference_drift", {"order": 1, "span_s": 180.0}, {"rate_nT_h": 60.0}, 0.01, 1.5),
         # a step between two readings a second apart: ten samples of 1800 are interpolated
         ("reference_step", {"time_s": 60.0}, {"steps_nT": [3.0], "time_s": [60.0]}, 0.1, 3.0),
     ],

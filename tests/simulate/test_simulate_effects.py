@@ -56,6 +56,7 @@ EVERY: dict[str, dict[str, Any]] = {
     "passing_source": {"time_s": 30.0, "closest_m": [8.0, 0.0, 0.0], "velocity_m_s": [0.0, 3.0, 0.0]},
     "reference_scale": {},
     "reference_clock": {},
+    "reference_drift": {},
     "reference_step": {"time_s": [20.0]},
 }
 

@@ -71,7 +71,7 @@ def course_of(whitened: Array, held: Array, direction: Array, good: NDArray[np.b
 def free_directions(held: Array) -> Array:
     """(n, n - rank) orthonormal directions in which the field moves nothing."""
     u, s, _ = np.linalg.svd(held, full_matrices=True)
-    rank = int(np.sum(s > 1e-6 * s[0]))
+    rank = int(np.sum(s > 1e-6 * s[0])) if len(s) else 0
     out: Array = u[:, rank:]
     return out
 

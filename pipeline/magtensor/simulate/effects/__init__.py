@@ -29,7 +29,7 @@ from magtensor.simulate.effects.platform import (
     TurnStep,
     ViscousMagnetisation,
 )
-from magtensor.simulate.effects.reference import ReferenceClock, ReferenceScale, ReferenceStep
+from magtensor.simulate.effects.reference import ReferenceClock, ReferenceDrift, ReferenceScale, ReferenceStep
 from magtensor.simulate.effects.sensor import (
     Bandwidth,
     CrossField,
@@ -76,6 +76,7 @@ AnyEffect = Annotated[
     | PassingSource
     | ReferenceScale
     | ReferenceClock
+    | ReferenceDrift
     | ReferenceStep,
     Field(discriminator="type"),
 ]

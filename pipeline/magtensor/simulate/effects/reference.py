@@ -66,6 +66,20 @@ class ReferenceClock(ReferenceEffectSpec):
         return total_field(stamp - late, 1.0) - total_field(stamp, 1.0)
 
 
+class ReferenceDrift(ReferenceEffectSpec):
+    """The base station drifts, steadily or until it has warmed up."""
+
+    COEFFICIENTS = "rate_nT_h"
+    type: Literal["reference_drift"]
+    rate_nT_h: float | None = Field(None, description="drift at the start, nT/h")
+    settles_s: float | None = Field(None, gt=0, description="time constant with which it settles, s; null: it goes on")
+
+    def waveform(self, total_field: TotalField, stamp: Array, coefficients: Array) -> Array:
+        lasted = stamp if self.settles_s is None else self.settles_s * -np.expm1(-stamp / self.settles_s)
+        out: Array = float(coefficients) * lasted / 3600.0
+        return out
+
+
 class ReferenceStep(ReferenceEffectSpec):
     """The base station was moved or retuned."""
 
