@@ -6,7 +6,7 @@ from pydantic import Field
 
 from magtensor.components import error_model
 from magtensor.loop.excitation import Excitation
-from magtensor.loop.settings import AnyChannel, Choice
+from magtensor.loop.settings import AnyChannel, Range
 from magtensor.loop.terms import Terms
 
 CURRENT = AnyChannel("current_*", or_units="A", vectors=False)
@@ -27,7 +27,7 @@ def current_field(
     channel: Annotated[str, CURRENT, Field(description="current channel; '': the only one")] = "",
     lag_s: Annotated[
         float,
-        Choice((0.0, 0.3, 1.0, 3.0, 10.0)),
+        Range(0.0, 10.0, count=6, spacing="log"),
         Field(ge=0, description="time constant of the current behind the logged one, s"),
     ] = 0.0,
 ) -> Terms:

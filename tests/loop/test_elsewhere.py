@@ -89,6 +89,15 @@ def test_spikes_of_another_survey_are_flagged(tmp_path: Path, folder: Path, plai
     np.testing.assert_array_equal(calibrated["calibrated/b"][keep.values], clean["calibrated/b"][keep.values])
 
 
+def test_a_survey_of_two_sensors_whose_places_are_known(tmp_path: Path) -> None:
+    """Field and gradient together can make any outputs of two sensors: nothing stands out."""
+    pair = scenario(5, motion=MOTION)
+    pair["instrument"] = pair["instrument"] | {"array": {"positions_m": [[0.25, 0.0, 0.0], [-0.25, 0.0, 0.0]]}}
+    calibration = magtensor.close_loop(survey_file(tmp_path, pair, "pair.h5"), search=[]).calibration
+    calibrated = calibration.apply(survey_file(tmp_path, pair | {"seed": 6}, "another.h5"))
+    assert calibrated["calibrated/good"].all()
+
+
 def test_spikes_do_not_spoil_the_verification(folder: Path) -> None:
     blocks = [
         magtensor.close_loop(folder / "heated.h5", search=["current_field"], verify=path).verdict["error"]["verify"]

@@ -27,7 +27,7 @@ from magtensor.loop.terms import Terms
 
 LONGEST_SPIKE = 2  # samples: what lasts longer is no accident of the recording
 ALPHA = 0.001  # of each of the tests
-NOISE = "what is left is noise: white, and slow noise of each sensor alone"
+NOISE = "what is left is noise: white, and slow noise of each sensor alone or of the reference"
 LEAST_T = 4.5  # one in a thousand by chance: paired t over folds of what the direction predicts
 LEAST_FOR_DIRECTION = 60  # samples for each output, at least, before its own polynomial can be asked for
 
