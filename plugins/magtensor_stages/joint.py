@@ -24,7 +24,9 @@ if TYPE_CHECKING:
     from magtensor.survey.model import Survey
 
 NoiseOfReference = Annotated[float, Field(ge=0, description="white noise of the total field, nT")]
-Robust = Annotated[bool, Field(description="leave out samples that no noise explains")]
+Robust = Annotated[
+    bool, Field(description="leave out samples that no noise explains; of fewer than 50 none is, they bend the fit")
+]
 TotalField = Annotated[
     Literal["measured", "constant", "per_survey", "per_segment"],
     Field(

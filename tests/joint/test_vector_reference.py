@@ -138,7 +138,7 @@ def test_a_poor_attitude_does_not_attenuate_the_matrix() -> None:
     assert np.abs(np.mean(found, axis=0)).max() < 2e-5
 
 
-@pytest.mark.parametrize("postures", [8, 12])
+@pytest.mark.parametrize("postures", [9, 12])
 def test_as_few_postures_as_determine_a_matrix_and_an_offset(postures: int) -> None:
     """A known direction tells three values of each posture, so that fewer do than nine."""
     found = [errors(surveys(seed, Case(samples=(postures,), attitude_deg=0.05, apart_nT=0.0))) for seed in range(60)]
@@ -146,8 +146,8 @@ def test_as_few_postures_as_determine_a_matrix_and_an_offset(postures: int) -> N
 
 
 def test_refusals() -> None:
-    few = surveys(4, Case(samples=(7,), attitude_deg=0.05, apart_nT=0.0))
-    with pytest.raises(NotEnoughData, match="5 attitudes and 8 samples are the least"):
+    few = surveys(4, Case(samples=(8,), attitude_deg=0.05, apart_nT=0.0))
+    with pytest.raises(NotEnoughData, match="5 attitudes and 9 samples are the least"):
         fit_surveys(few.samples, common_offsets=True)
     one = surveys(4, Case(samples=(11,), attitude_deg=0.05, apart_nT=0.0, sensors=1))
     with pytest.raises(NotEnoughData, match="12 samples are the least"):
@@ -156,6 +156,16 @@ def test_refusals() -> None:
     assert truth.samples.direction is not None
     with pytest.raises(DataError, match="mirror"):
         fit_surveys(replace(truth.samples, raw=-truth.samples.raw, direction=truth.samples.direction))
+    level = surveys(5, Case(samples=(200,), attitude_deg=0.1)).samples
+    assert level.direction is not None
+    yaw = np.column_stack([level.direction[:, :2], np.full(200, 0.8)])
+    yaw[:, :2] *= 0.6 / np.linalg.norm(yaw[:, :2], axis=1, keepdims=True)
+    varying = level.total_field * (1 + 4e-4 * np.sin(np.arange(200)))
+    raw = np.repeat((yaw * varying[:, None])[:, None], 4, axis=1) + np.random.default_rng(6).standard_normal(
+        (200, 4, 3)
+    )
+    with pytest.raises(NotEnoughData, match="did not leave a plane"):  # but for the field's own variation
+        fit_surveys(replace(level, raw=raw, total_field=varying, direction=yaw))
     flat = np.tile([[1.0, 0, 0]], (200, 1))
     with pytest.raises(NotEnoughData, match="did not leave a plane"):
         fit_surveys(replace(truth.samples, direction=flat))

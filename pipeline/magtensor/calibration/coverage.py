@@ -246,7 +246,7 @@ def coverage_alone(raw: Array, total_field: Array) -> tuple[Coverage, Array]:
     try:
         nearest = fit_ellipsoid(raw, total_field, gradient_normalised)
     except NotAnEllipsoid:
-        return coverage(raw, total_field), np.zeros(3)
+        return replace(coverage(raw, total_field), worst_error=float("inf")), np.zeros(3)
     matrix = factor(nearest.shape, "polar")
     return coverage(raw, total_field, matrix=matrix, offset=nearest.offset), nearest.offset
 

@@ -21,15 +21,17 @@ from magtensor.calibration.surveys.directions import across
 from magtensor.calibration.surveys.fit import SurveysFit, fit_surveys, frame_of, whitened
 from magtensor.calibration.surveys.samples import Samples
 from magtensor.calibration.types import Array
-from magtensor.errors import DataError
+from magtensor.errors import DataError, NotEnoughData
 from magtensor.loop.assessment import Colours, colours_of, estimated
 from magtensor.loop.excitation import Excitation
 from magtensor.loop.model import MOST_ROUNDS, SETTLED, Adopted, Record, share_of
 from magtensor.loop.residual import Levels, Residual, Sighted
 from magtensor.loop.statistics import Estimate
 from magtensor.loop.stretches import borne_out_in
-from magtensor.loop.terms import Terms, joined, stacked
+from magtensor.loop.terms import REFERENCE, Terms, joined, stacked
 from magtensor.loop.turned import SlowModes, TurnedColour
+
+LEAST_LEFT = 8  # values along the field beyond the parameters: of fewer the noise is not known
 
 
 @dataclass(frozen=True)
@@ -83,6 +85,7 @@ def surveys_state(of: Together) -> SurveysState:
         each = _terms(of, samples, fit)
         residual = residual_of_surveys(fit, samples)
         terms = joined(each).at(residual.samples)
+        _require_enough(residual, terms, fit)
         colours = colours_of(residual, stiff=True)
         estimate = estimated(residual, terms, _beside_what_is_free(colours, residual, terms.count))
         before = theta if len(theta) else np.zeros(terms.count)
@@ -98,6 +101,21 @@ def surveys_state(of: Together) -> SurveysState:
     terms = joined(_terms(of, samples, fit)).at(residual.samples)
     parts = tuple(np.split(theta, np.cumsum([e.count for e in each])[:-1]))
     return SurveysState(tuple(of.adopted[0]), parts, fit, samples, residual, terms, estimate)
+
+
+def _require_enough(residual: Residual, terms: Terms, fit: SurveysFit) -> None:
+    """Refuse samples that the parameters follow one by one, so that nothing is left to tell their noise by."""
+    own = terms.part_output != REFERENCE
+    columns = min(3 * len(np.unique(terms.part_series[own])) + int((~own).sum()), terms.count)
+    data, count = fit.data, len(residual.affine)
+    constants = 0 if data.level is None else len(np.unique(data.level))
+    free = (6 + 3 * data.centres if data.sighting is None else 3 + data.centres) + constants
+    if count - free - columns < LEAST_LEFT:
+        raise NotEnoughData(
+            f"{count} samples are too few for C, o and {terms.count} coefficients of error models: along the field "
+            f"they have {free + columns} parameters to follow",
+            hint=f"declare fewer error models, or take {free + columns + LEAST_LEFT} samples in as many postures",
+        )
 
 
 def _fitted(of: Together, samples: Samples, lasting: bool) -> tuple[SurveysFit, bool]:

@@ -19,7 +19,7 @@ from magtensor.calibration.types import Array
 
 from .sums import SYMMETRIC, Found, InPlane
 
-LEAST_SIGHTED = 8  # samples of known direction: the attitude's own error is found from what they leave,
+LEAST_SIGHTED = 9  # samples of known direction: the attitude's own error is found from what they leave,
 LEAST_SIGHTED_ALONE = 12  # and the sensor's noise too where no neighbour tells it
 LEAST_ATTITUDES_SIGHTED = 5  # four determine a matrix and an offset
 _PICKED = 20_000  # samples that the words are found from

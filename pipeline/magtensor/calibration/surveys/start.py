@@ -12,6 +12,8 @@ from magtensor.errors import NotEnoughData
 
 from .sums import Found, InPlane, minimised, summed
 
+LEAST_LEAVING = 2e-3  # of F: what leaves the plane less is the field's variation and the attitude's error
+
 
 def on_known_field(data: InPlane, direction: Array) -> tuple[Array, Array]:
     """Matrix (3, 3) and centres (K, 3) by regression of y on the known field.
@@ -28,7 +30,7 @@ def on_known_field(data: InPlane, direction: Array) -> tuple[Array, Array]:
         means[0, k], means[1, k] = field[own].mean(axis=0), data.y[own].mean(axis=0)
         x[own], y[own] = field[own] - means[0, k], data.y[own] - means[1, k]
     values = np.linalg.eigvalsh(x.T @ x)
-    if values[0] <= 1e-8 * values[-1]:
+    if np.sqrt(values[0] / len(x)) <= LEAST_LEAVING * np.mean(data.total_field):
         raise NotEnoughData(
             "the field did not leave a plane in the platform's frame", hint="turn the platform about a second axis"
         )
