@@ -75,7 +75,7 @@ class Grams:
         """For each block, the sum of all others."""
         return self._with(lambda a: a.sum(axis=0, keepdims=True) - a)
 
-    def chosen(self, masks: Array) -> Grams:
+    def chosen(self, masks: NDArray[np.bool_]) -> Grams:
         """For each row of masks (R, B), the sum of the blocks it marks."""
         return self._with(lambda a: np.tensordot(masks.astype(float), a, axes=1))
 

@@ -16,6 +16,7 @@ IDENTIFIABLE = 1e-6  # of a regressor's own information: a direction with less l
 BLOCK_COUNTS = (120, 30, 12)  # long blocks protect against correlation longer than a short block
 LEAST_BLOCKS = 6
 FOLDS = 10
+INTERLEAVED_FOLDS = 20
 LEAST_T = 2.0  # paired t of the held-out gain over folds
 LEAST_SHARE_OF_FOLDS = 0.8  # a strong slow effect gains unevenly, which keeps t low, but nearly everywhere
 LEAST_LEFT = 1e-3  # of the information in a direction, without any one block
@@ -251,16 +252,46 @@ def held_out_gain(g: Grams, freedom: int, blocked: NDArray[np.bool_] | None = No
     for k, (a, b) in enumerate(itertools.pairwise(edges)):
         test_masks[k, a:b] = True
         train_masks[k, max(a - gap, 0) : b + gap] = False
+    every = np.ones(g.count, dtype=bool)
+    return gain_over(g, freedom, test_masks, train_masks, ~every if blocked is None else blocked, every)
+
+
+def interleaved_gain(g: Grams, freedom: int, before: NDArray[np.bool_], after: NDArray[np.bool_]) -> Gain:
+    """Gain of the terms `after` (P,) over those `before` (P,) on folds of blocks that lie evenly between all others.
+
+    For terms that change slowly over the survey: what they do in a long stretch does not follow from the others.
+    """
+    folds = min(INTERLEAVED_FOLDS, len(g.zz))
+    number = np.arange(len(g.zz)) % folds
+    test_masks = number == np.arange(folds)[:, None]
+    return gain_over(g, freedom, test_masks, ~test_masks, before, after)
+
+
+def gain_over(
+    g: Grams,
+    freedom: int,
+    test_masks: NDArray[np.bool_],
+    train_masks: NDArray[np.bool_],
+    before: NDArray[np.bool_],
+    after: NDArray[np.bool_],
+) -> Gain:
+    """Gain of some terms over others of them.
+
+    Parameters
+    ----------
+    g: the finest blocks.
+    freedom: residual values a sample.
+    test_masks, train_masks: (folds, B) the blocks of each fold.
+    before, after: (P,) terms of the two models compared.
+    """
     train, test = g.chosen(train_masks), g.chosen(test_masks)
     n, y = normal(train)
     scale = own_information(g)
-    theta = np.stack([solve(n[k], y[k], scale).theta for k in range(folds)])
-    if blocked is None:
-        before, after = held_out(train, test, theta)
-    else:
-        without = np.zeros_like(theta)
-        keep = np.flatnonzero(blocked)
-        if len(keep):
-            without[:, keep] = [solve(n[k][np.ix_(keep, keep)], y[k][keep], scale[keep]).theta for k in range(folds)]
-        before, after = held_out(train, test, without)[1], held_out(train, test, theta)[1]
-    return Gain(before, after, test.samples * freedom)
+
+    def loss(terms: NDArray[np.bool_]) -> Array:
+        theta, use = np.zeros_like(y), np.flatnonzero(terms)
+        if len(use):
+            theta[:, use] = [solve(a[np.ix_(use, use)], b[use], scale[use]).theta for a, b in zip(n, y, strict=True)]
+        return held_out(train, test, theta)[1]
+
+    return Gain(loss(before), loss(after), test.samples * freedom)

@@ -1,8 +1,8 @@
 """What is left when the search has ended: is it noise, and if not, what does it look like?
 
 Independent sensors have independent noise, white or slow. So what is left is called unexplained only where noise
-cannot make it: a waveform that the sensors share, a line in the spectrum, or an error model that is significant and
-was not adopted.
+cannot make it: a waveform that the sensors share, a line in the spectrum, what follows the direction of the field, a
+sensor whose matrix is not constant, or an error model that is significant and was not adopted.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import numpy as np
 
 from magtensor.calibration.types import Mask
 from magtensor.loop.assessment import WHITE, assess
+from magtensor.loop.changing_matrix import changing_matrices
 from magtensor.loop.direction import direction_series
 from magtensor.loop.excitation import Excitation
 from magtensor.loop.latent import shared_words
@@ -52,6 +53,7 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
         words.append(f"a line at {line[0]:.4g} Hz (period {1 / line[0]:.4g} s), {line[1]:.3g} nT rms")
     if turning > 0:
         words.append(f"{turning:.3g} nT rms of it can be predicted from the direction of the field and how it turns")
+    words.extend(one.words for one in changing_matrices(state, ALPHA))
     if open_ := [c.model.name for c in suspects if c.passes]:
         words.append(f"significant, passes the first two gates of the loop and is not adopted: {', '.join(open_)}")
     if useless := [c.model.name for c in suspects if not c.passes]:
