@@ -59,12 +59,12 @@ def left_open(survey: Survey) -> tuple[str, ...]:
     return (*json.loads(str(attributes.get("unobservable", "[]"))), *reason)
 
 
-def told_of_disagreement(survey: Survey) -> tuple[str, ...]:
-    """What a fit of one C to several surveys says of how they disagree about it; nothing where they agree."""
+def told_of_fit(survey: Survey) -> tuple[str, ...]:
+    """What a fit says of its own doubts: surveys that disagree about one C, attitudes too poor for their number."""
     if "calibration/matrix" not in survey:
         return ()
-    words = json.loads(str(survey["calibration/matrix"].attrs.get("diagnostics", "{}"))).get("disagreement")
-    return (str(words),) if words else ()
+    told = json.loads(str(survey["calibration/matrix"].attrs.get("diagnostics", "{}")))
+    return tuple(str(told[name]) for name in ("disagreement", "caution") if told.get(name))
 
 
 def restored(survey: Survey) -> ArrayCalibration:

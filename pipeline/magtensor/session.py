@@ -11,7 +11,7 @@ from typing import Any
 from magtensor import provenance, result
 from magtensor.applying import verification
 from magtensor.atomic import refuse_overwriting, require_writable
-from magtensor.calibrated import left_open, told_of_disagreement
+from magtensor.calibrated import left_open, told_of_fit
 from magtensor.dated import told_of_change
 from magtensor.errors import UsageError
 from magtensor.preparing import empty_survey, load_as
@@ -160,7 +160,7 @@ class Computed:
         notes = (
             *(f"not determined: {words}" for words in left_open(self.survey)),
             *told_of_change(self.survey),
-            *told_of_disagreement(self.survey),
+            *told_of_fit(self.survey),
             *told(self.survey),
         )
         if left := (self.outcome["error"].get("verify") or {}).get("not_taken_off"):

@@ -13,6 +13,8 @@ from magtensor.calibration.types import Array, ArrayCalibration
 from .covariance import as_white, covariance_of, to_corrections, with_offset
 from .fit import SurveysFit, frame_of
 
+NOT_LINEAR = 0.5  # of the noise along the field: the change of |b| in second order that is worth a word
+
 
 @dataclass(frozen=True)
 class SurveysCalibration:
@@ -99,7 +101,27 @@ def frame_words(fit: SurveysFit) -> tuple[str, tuple[str, ...], dict[str, float 
         "attitude_std_deg": float(np.degrees(fit.attitude_std)),
         "attitude_excess": fit.attitude_excess,
     }
+    if words := _second_order(fit, fit.attitude_std):
+        told["caution"] = words
     return "platform (by the attitude and the known field)", (), told
+
+
+def _second_order(fit: SurveysFit, attitude_std: float) -> str:
+    """Whether few directions of poor attitudes leave C so uncertain that its errors are not linear in theirs.
+
+    With four parameters an axis C turns the field by some 2 attitude_std / sqrt(N), which shortens it by half the
+    square of that: a change of |b| that the covariance knows nothing of.
+    """
+    count = int(fit.keep.sum())
+    moved = 2.0 * float(np.mean(fit.found.sums.total_field)) * attitude_std**2 / count
+    noise = float(np.sqrt(np.mean(fit.plane.noise**2) / len(fit.forward)))
+    if moved < NOT_LINEAR * noise:
+        return ""
+    return (
+        f"an attitude known to {np.degrees(attitude_std):.2g} deg in {count} samples leaves C so uncertain that |b| "
+        f"changes by some {moved:.2g} nT in second order, beside {noise:.2g} nT of noise: errors are larger than the "
+        "standard deviations say; take more attitudes"
+    )
 
 
 def calibrated_surveys(fit: SurveysFit) -> SurveysCalibration:
