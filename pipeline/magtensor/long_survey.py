@@ -129,8 +129,8 @@ def run_long(
     _require_windows(planned)
     survey_file = source.paths(source.section)[0]
     where = windows(source, memory_GiB)
-    output.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryFile(dir=output) as file:
+    beside = next(folder for folder in (output, *output.absolute().parents) if folder.is_dir())
+    with tempfile.TemporaryFile(dir=beside) as file:
         prepared = _prepared(planned, survey_file, where, file, say)
         survey, doubted, records = _calibrated(rest, prepared, say)
         blocks: list[tuple[int, dict[str, Any] | None]] = []

@@ -127,6 +127,10 @@ def test_apply_in_windows_gives_the_same_bits(folder: Path) -> None:
     [
         ("[load, detrend_diurnal, close_loop]", "close_loop needs the whole survey.*calibrate_joint"),
         ("[load, detrend_diurnal, calibrate_scalar, align]", "calibrate_scalar needs the whole survey"),
+        (
+            "[load, detrend_diurnal: {uncovered: mask}, calibrate_joint: {error_models: {offset_drift: {}}}]",
+            "error_models.*whole survey",
+        ),
         ("[load, detrend_diurnal]", "calibrates nothing"),
         ("[load: {window_s: [0, 10]}, detrend_diurnal, calibrate_joint]", "window_s"),
     ],
@@ -137,6 +141,7 @@ def test_what_needs_the_whole_survey_is_refused(folder: Path, tmp_path: Path, st
     with pytest.raises(MagtensorError, match=told) as refused:
         magtensor("run", recipe, "--input", folder / "b.h5", "--output", tmp_path / "out", "--memory", 1)
     assert refused.value.exit_status == 2
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_table_of_text_is_not_read_in_windows(tmp_path: Path) -> None:
