@@ -8,7 +8,6 @@ which keeps trends from leaking round the ends.
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -88,8 +87,8 @@ def colour_of(series: Array, freedom: float | None = None, *, stiff: bool = Fals
     power = power[1:]
     frequency = np.arange(1, n) / (2.0 * n)  # cycles per sample
     edges = np.unique(np.round(np.geomspace(1, n, min(60, n // 4))).astype(int))
-    level = np.array([power[a - 1 : b - 1].mean() for a, b in itertools.pairwise(edges)])
-    centre = np.array([frequency[a - 1 : b - 1].mean() for a, b in itertools.pairwise(edges)])
+    level = np.add.reduceat(power, edges[:-1] - 1) / np.diff(edges)
+    centre = (edges[:-1] + edges[1:] - 1) / (4.0 * n)
     count = np.diff(edges) * k * share
     shapes_of = _laws if stiff else _relaxations
     shapes = shapes_of(centre, n)

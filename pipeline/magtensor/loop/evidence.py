@@ -69,7 +69,7 @@ class Grams:
 
     def total(self) -> Grams:
         """All blocks as one."""
-        return self._with(lambda a: a.sum(axis=0, keepdims=True))
+        return self if len(self.zz) == 1 else self._with(lambda a: a.sum(axis=0, keepdims=True))
 
     def without_each(self) -> Grams:
         """For each block, the sum of all others."""
@@ -284,12 +284,21 @@ def normal(g: Grams) -> tuple[Array, Array]:
         y += c[:, s, o] @ into.T
     if g.aa.any():
         m = g.own
-        own = np.linalg.pinv(g.aa[:, :m, :m], rcond=_INNER_RANK, hermitian=True)
+        own = _inverse(g.aa[:, :m, :m])
         mixed = g.aa[:, :m, m:]
         turned = np.swapaxes(mixed, 1, 2) @ own
         n += g.aa[:, m:, m:] - turned @ mixed
         y += g.ar[:, m:] - (turned @ g.ar[:, :m, None])[:, :, 0]
     return n, y
+
+
+def _inverse(information: Array) -> Array:
+    """(B, Q, Q) pseudo-inverses of symmetric matrices of no negative eigenvalue; the rank along the field is known to
+    be smaller than Q."""
+    values, vectors = np.linalg.eigh(information)
+    seen = values > _INNER_RANK * values[:, -1:]
+    out: Array = (vectors * np.where(seen, 1.0 / np.where(seen, values, 1.0), 0.0)[:, None, :]) @ vectors.swapaxes(1, 2)
+    return out
 
 
 def _incidence(g: Grams) -> Array:
@@ -332,7 +341,7 @@ def _loss(train: Grams, test: Grams, theta: Array) -> Array:
         loss -= 2 * (np.einsum("bij,bij->b", own, test.ze) + np.einsum("bij,bij->b", w, test.de))
     if train.aa.any():
         m = train.own
-        inverse = np.linalg.pinv(train.aa[:, :m, :m], rcond=_INNER_RANK, hermitian=True)
+        inverse = _inverse(train.aa[:, :m, :m])
         right = train.ar[:, :m] - np.einsum("bij,bj->bi", train.aa[:, :m, m:], theta)
         full = np.concatenate([np.einsum("bij,bj->bi", inverse, right), theta], axis=1)
         loss += test.rr - 2 * np.einsum("bi,bi->b", full, test.ar) + np.einsum("bi,bij,bj->b", full, test.aa, full)
