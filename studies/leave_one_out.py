@@ -34,9 +34,10 @@ from loop_power import Trial, models, simulated, trial_of
 from loop_surveys import EFFECTS, recorded
 
 from magtensor.errors import MagtensorError
+from magtensor.loop.contribution import removal
 from magtensor.loop.errors_before_after import held_out_error
 from magtensor.loop.model import Fitting
-from magtensor.loop.search import removal, search
+from magtensor.loop.search import search
 from magtensor.loop.unexplained import unexplained
 
 FIRST_SEED = 5000

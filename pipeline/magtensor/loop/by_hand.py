@@ -9,12 +9,14 @@ from typing import Any
 
 from magtensor.components import Component
 from magtensor.errors import DataError, NotEnoughData, UsageError, did_you_mean
+from magtensor.loop.adopting import adopt
 from magtensor.loop.assessment import estimated
+from magtensor.loop.contribution import removal
 from magtensor.loop.latent import NAME, renewed, sought, tried_source
 from magtensor.loop.model import Fitting, Record, State, joint_state
 from magtensor.loop.outcome import why
 from magtensor.loop.screening import Candidate, candidates_of, profiled
-from magtensor.loop.search import Step, adopt, removal, simplest
+from magtensor.loop.search import Step, simplest
 from magtensor.loop.settings import AnyChannel
 from magtensor.loop.trial import trial
 

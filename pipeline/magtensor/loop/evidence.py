@@ -167,6 +167,8 @@ def grams(residual: Residual, terms: Terms, across: Colour, along: Colour | Turn
 
 def grams_in(white: Whitened, terms: Terms | None, blocks: int = 1) -> Grams:
     """The same of the terms that are in a whitened residual already, and of more where there are any."""
+    from scipy.linalg import block_diag
+
     residual = white.residual
     assert white.over_time or blocks == 1
     together = joined([t for t in (white.given, terms) if t is not None])
@@ -186,7 +188,7 @@ def grams_in(white: Whitened, terms: Terms | None, blocks: int = 1) -> Grams:
     if white.inner is not None and white.r is not None:
         columns = [Columns(white.inner, np.eye(3 * own))]
         columns += [c for c in (white.columns, None if terms is None else white.columns_of(terms)) if c is not None]
-        base, mix = np.hstack([c.base for c in columns]), _side_by_side([c.mix for c in columns])
+        base, mix = np.hstack([c.base for c in columns]), block_diag(*(c.mix for c in columns))
         for i, (a, b) in enumerate(pieces):
             part, r = base[a:b], white.r[a:b]
             aa[i], ar[i], rr[i] = mix.T @ (part.T @ part) @ mix, (part.T @ r) @ mix, r @ r
@@ -216,16 +218,6 @@ def _beside(
         more = whitened(terms)
         parts.append(np.zeros_like(terms.series) if more is None else more)
     return parts[0] if len(parts) == 1 else np.hstack(parts)
-
-
-def _side_by_side(parts: list[Array]) -> Array:
-    """The block-diagonal matrix of matrices."""
-    out = np.zeros((sum(len(p) for p in parts), sum(p.shape[1] for p in parts)))
-    row = column = 0
-    for part in parts:
-        out[row : row + len(part), column : column + part.shape[1]] = part
-        row, column = row + len(part), column + part.shape[1]
-    return out
 
 
 def along_the_field(residual: Residual, terms: Terms) -> Columns:

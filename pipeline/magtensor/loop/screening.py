@@ -25,7 +25,7 @@ from magtensor.loop.model import Adopted, State, regressors
 from magtensor.loop.multiplicity import alike, effective_tests, projected
 from magtensor.loop.residual import Residual
 from magtensor.loop.scoring import Scorer
-from magtensor.loop.separation import Assessed, lower_orders, lowest
+from magtensor.loop.separation import SEPARATION, Assessed, lower_orders, lowest
 from magtensor.loop.settings import EventTimes, Range
 from magtensor.loop.terms import Terms, joined
 
@@ -338,7 +338,8 @@ def _terms(model: Component, settings: Mapping[str, Any], x: Excitation, failed:
 
 
 def _refined(model: Component, settings: dict[str, Any], state: State, failed: dict[str, str]) -> dict[str, Any]:
-    """Settings on a range, moved between the neighbours of the best grid value by golden section."""
+    """Settings on a range, moved between the neighbours of the best grid value by golden section; a lag of none stays
+    one where the data do not separate the two."""
     few = _thinned(state, REFINING_SAMPLES)
     for name, grid in profiled(model).items():
         if not isinstance(grid, (Range, EventTimes)):
@@ -358,7 +359,10 @@ def _refined(model: Component, settings: dict[str, Any], state: State, failed: d
             found = _terms(model, {**rest, name: value}, state.excitation, failed)
             return -np.inf if found is None else score(found.at(few[0].samples))
 
-        settings = {**settings, name: golden(gain, low, high, settings[name])}
+        best = golden(gain, low, high, settings[name])
+        if low == 0.0 and gain(best) - gain(0.0) < SEPARATION / 2.0:
+            best = 0.0
+        settings = {**settings, name: best}
     return settings
 
 

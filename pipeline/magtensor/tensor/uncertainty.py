@@ -53,10 +53,7 @@ def noise_covariance_of_components(assembly: Assembly, noise_covariance: Array) 
 
 def noise_tensor_std(assembly: Assembly, noise_covariance: Array) -> Array:
     """Standard deviation (3, 3) in nT/m of each element from sensor noise; NaN where it is not measured."""
-    rows = _nine_rows(assembly)
-    covariance = checked_noise_covariance(noise_covariance, assembly.field_gain.shape[1])
-    out: Array = np.sqrt(np.einsum("ap,pq,aq->a", rows, covariance, rows)).reshape(3, 3)
-    return out
+    return np.sqrt(_noise_variance(_nine_rows(assembly), assembly, noise_covariance)).reshape(3, 3)
 
 
 def component_covariance(
@@ -103,19 +100,10 @@ def tensor_std(
 
     Parameters as in `component_covariance`; works through any number of samples in pieces.
     """
-    fields = assembly.checked_fields(b)
-    variance = np.zeros((len(fields), 9))
-    if noise_covariance is not None:
-        variance += noise_tensor_std(assembly, noise_covariance).ravel() ** 2
-    if calibration is not None:
-        distinct = _UPPER if assembly.symmetric else np.arange(9)
-        copies = _UPPER_OF_NINE if assembly.symmetric else np.arange(9)
-        each = np.arange(len(distinct))
-        rows = _nine_rows(assembly)[distinct]
-        for part, values in _calibration_terms(rows, (each, each), fields, calibration, taken_off):
-            variance[part] += np.maximum(values, 0)[:, copies]  # rounding can make a zero variance negative
-    out: Array = np.sqrt(variance).reshape(-1, 3, 3)
-    return out
+    distinct = _UPPER if assembly.symmetric else np.arange(9)
+    copies = _UPPER_OF_NINE if assembly.symmetric else np.arange(9)
+    found = _std(_nine_rows(assembly)[distinct], assembly, b, noise_covariance, calibration, taken_off)
+    return found[:, copies].reshape(-1, 3, 3)
 
 
 def mean_field_std(
@@ -130,16 +118,32 @@ def mean_field_std(
 
     Parameters as in `component_covariance`. A rotation of the frame that the covariance does not hold is not in it.
     """
-    fields, rows = assembly.checked_fields(b), assembly.field_gain.reshape(3, -1)
-    variance = np.zeros((len(fields), 3))
+    return _std(assembly.field_gain.reshape(3, -1), assembly, b, noise_covariance, calibration, taken_off)
+
+
+def _std(
+    rows: Array,
+    assembly: Assembly,
+    b: Array,
+    noise_covariance: Array | None,
+    calibration: ArrayCalibration | None,
+    taken_off: TakenOff | None,
+) -> Array:
+    """Standard deviations (N, K) of the combinations rows (K, 3 S) of the calibrated fields."""
+    fields = assembly.checked_fields(b)
+    variance = np.zeros((len(fields), len(rows)))
     if noise_covariance is not None:
-        noise = checked_noise_covariance(noise_covariance, assembly.field_gain.shape[1])
-        variance += np.einsum("ap,pq,aq->a", rows, noise, rows)
+        variance += _noise_variance(rows, assembly, noise_covariance)
     if calibration is not None:
-        each = np.arange(3)
+        each = np.arange(len(rows))
         for part, values in _calibration_terms(rows, (each, each), fields, calibration, taken_off):
-            variance[part] += np.maximum(values, 0)
-    out: Array = np.sqrt(variance)
+            variance[part] += np.maximum(values, 0)  # rounding can make a zero variance negative
+    return np.sqrt(variance)
+
+
+def _noise_variance(rows: Array, assembly: Assembly, noise_covariance: Array) -> Array:
+    covariance = checked_noise_covariance(noise_covariance, assembly.field_gain.shape[1])
+    out: Array = np.einsum("ap,pq,aq->a", rows, covariance, rows)
     return out
 
 

@@ -1,0 +1,142 @@
+"""Refit with a model that is adopted: on which of its sensors, and with its settings sought once more."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from magtensor.loop.assessment import estimated, explained
+from magtensor.loop.contribution import KEEP_ALPHA, put_back, significance, slices
+from magtensor.loop.model import Adopted, Fitting, Record, State, joint_state
+from magtensor.loop.scoring import Scorer
+from magtensor.loop.screening import Candidate, golden, profiled
+from magtensor.loop.settings import Range
+
+POLISH = 0.1  # of a setting, to either side
+_SWEEPS = 6  # over all settings, where two models of one kind are in
+_RESTS = 0.02  # relative: a setting that moves no further is settled
+
+
+def adopt(record: Record, state: State, chosen: Candidate, how: Fitting) -> State:
+    """Refit with the chosen model, first on all sensors, then on those that show it."""
+    # what it found of the others too: begun from zero, a strong slow effect would pass for the colour of the noise
+    moves = np.split(chosen.assessment.theta, np.cumsum([len(t) for t in state.theta]))
+    start = [t + move for t, move in zip([*state.theta, np.zeros(chosen.terms.count)], moves, strict=True)]
+    after = joint_state(record, [*state.adopted, chosen.model], how, start)
+    which = len(state.adopted)
+    sensors = _sensors_showing(after, which)
+    if sensors is None or not _spare(after, which, sensors):
+        sensors = _sufficient(after, which)
+    return after if sensors is None else narrowed(record, after, which, sensors, how)
+
+
+def narrowed(record: Record, state: State, which: int, sensors: tuple[str, ...], how: Fitting) -> State:
+    """Refit with one of the models on some of its sensors only."""
+    model = state.adopted[which]
+    models = list(state.adopted)
+    models[which] = Adopted(model.component, model.settings, sensors)
+    assert state.terms is not None
+    part = slices(state)[which]
+    keep = [i for i, s in enumerate(state.terms.sensors[part]) if s in sensors or s == ""]
+    theta = list(state.theta)
+    theta[which] = theta[which][keep]
+    return joint_state(record, models, how, theta)
+
+
+def _spare(state: State, which: int, sensors: tuple[str, ...]) -> bool:
+    """Whether a model can do without its coefficients for all but some sensors.
+
+    A coefficient may be insignificant because others can stand in for it, as where only differences between sensors
+    are seen (a delay of all of them is a turn of the field): each could go, and not several of them.
+    """
+    from scipy.special import chdtri
+
+    gone, seen, lost = _without_others(state, which, sensors)
+    return seen == gone and lost < float(chdtri(gone, KEEP_ALPHA))
+
+
+def _sufficient(state: State, which: int) -> tuple[str, ...] | None:
+    """The one sensor whose coefficients explain all that a model does, where others can stand in for them.
+
+    If only differences between sensors are seen, one that turned is like all others turned the other way: every
+    coefficient is significant, or none is. None where no sensor suffices, or several do.
+    """
+    from scipy.special import chdtri
+
+    assert state.terms is not None
+    owners = state.terms.sensors[slices(state)[which]]
+    found = []
+    for sensor in sorted(set(owners) - {""}):
+        gone, seen, lost = _without_others(state, which, (sensor,))
+        if 0 < seen < gone and lost < float(chdtri(seen, KEEP_ALPHA)):
+            found.append(sensor)
+    return tuple(found) if len(found) == 1 else None
+
+
+def _without_others(state: State, which: int, sensors: tuple[str, ...]) -> tuple[int, int, float]:
+    """Of a model's coefficients for all but some sensors: how many, how many directions of them the survey shows, and
+    what is explained no longer without them."""
+    assert state.terms is not None
+    part = slices(state)[which]
+    kept = [i for i, s in enumerate(state.terms.sensors) if not part.start <= i < part.stop or s in sensors or s == ""]
+    back = put_back(state.residual, state.terms, np.concatenate(state.theta))
+    every = estimated(back, state.terms, state.colours)
+    fewer = estimated(back, state.terms.only(kept), state.colours)
+    return state.terms.count - len(kept), every.rank - fewer.rank, explained(every) - explained(fewer)
+
+
+def _sensors_showing(state: State, which: int) -> tuple[str, ...] | None:
+    """Sensors whose own coefficients are significant; None where all are, or the model is not of single sensors."""
+    part = slices(state)[which]
+    assert state.terms is not None
+    owners = state.terms.sensors[part]
+    names = [s for s in state.excitation.sensors if s in owners]
+    if len(names) < 2:
+        return None
+    showing = [
+        s
+        for s in names
+        if significance(state, [part.start + i for i, o in enumerate(owners) if o == s]) < KEEP_ALPHA / len(names)
+    ]
+    return tuple(showing) if showing and len(showing) < len(names) else None
+
+
+def polished(record: Record, state: State, how: Fitting) -> State:
+    """The settings on a range, sought once more now that everything is fitted together; a setting that is a little
+    off leaves a residual that another model would be adopted for."""
+    for _ in range(_SWEEPS):
+        moved = False
+        for number, model in enumerate(state.adopted):
+            for name, grid in profiled(model.component).items():
+                if not isinstance(grid, Range) or not state.adopted[number].settings[name]:
+                    continue
+                here = float(state.adopted[number].settings[name])
+                best = _sought_anew(state, number, name)
+                if best == here:
+                    continue
+                moved |= abs(best - here) > _RESTS * abs(here)
+                now = state.adopted[number]
+                changed = Adopted(now.component, {**now.settings, name: best}, now.sensors)
+                models = [changed if i == number else a for i, a in enumerate(state.adopted)]
+                state = joint_state(record, models, how, state.theta)
+        # one setting of a kind rests at once; of two, one moves as the other does
+        if not moved or len({a.name for a in state.adopted}) == len(state.adopted):
+            break
+    return state
+
+
+def _sought_anew(state: State, number: int, name: str) -> float:
+    """A setting of one of the adopted models near where it is, by what the model explains beside the others."""
+    now = state.adopted[number]
+    own = slices(state)[number]
+    assert state.terms is not None
+    mine = state.terms.only(range(own.start, own.stop))
+    others = [i for i in range(state.terms.count) if not own.start <= i < own.stop]
+    back = put_back(state.residual, mine, state.theta[number])
+    score = Scorer(back, state.terms.only(others) if others else None, state.colours)
+
+    def gain(value: float) -> float:
+        changed = Adopted(now.component, {**now.settings, name: value}, now.sensors)
+        return score(changed.terms(state.excitation).at(state.residual.samples))
+
+    here = float(now.settings[name])
+    return golden(gain, here * (1 - POLISH), here * (1 + POLISH), here)

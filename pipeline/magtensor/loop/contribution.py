@@ -1,0 +1,80 @@
+"""What adopted models contribute beside each other, and which no longer earn their place."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+
+import numpy as np
+
+from magtensor.calibration.types import Array
+from magtensor.loop.assessment import WHITE, Colours, block_count
+from magtensor.loop.evidence import Grams, grams
+from magtensor.loop.model import Fitting, Record, State, joint_state
+from magtensor.loop.residual import Residual, taken_off
+from magtensor.loop.statistics import family_p, held_out_gain
+from magtensor.loop.terms import Terms
+from magtensor.loop.trial import WORST_RISE
+
+KEEP_ALPHA = 0.01  # an adopted effect that is no longer significant at this level is dropped
+
+
+def slices(state: State) -> list[slice]:
+    edges = np.cumsum([0, *(len(t) for t in state.theta)])
+    return [slice(int(a), int(b)) for a, b in itertools.pairwise(edges)]
+
+
+def significance(state: State, chosen: Sequence[int]) -> float:
+    """P value of some of the adopted coefficients, the others free: of the residual with their part put back."""
+    assert state.terms is not None
+    return family_p(_blocks(state), state.terms.sensors, list(chosen))
+
+
+def _blocks(state: State, colours: Colours | None = None) -> Grams:
+    """Of the adopted terms and the residual with their part put back, in the finest blocks, in noise of its own colour
+    or another."""
+    assert state.terms is not None
+    back = put_back(state.residual, state.terms, np.concatenate(state.theta))
+    noise = colours or state.colours
+    return grams(back, state.terms, noise.across, noise.along, block_count(len(state.residual.affine)))
+
+
+def removal(state: State, index: int) -> tuple[float, float]:
+    """Held-out rms of the residual in nT, all noise alike, without and with one of the adopted models, the others in
+    both."""
+    assert state.terms is not None
+    part, order = slices(state)[index], np.arange(state.terms.count)
+    others = (order < part.start) | (order >= part.stop)
+    before, after = held_out_gain(_blocks(state, WHITE), state.residual.freedom, others).rms
+    return before * state.residual.scale, after * state.residual.scale
+
+
+def put_back(residual: Residual, terms: Terms, theta: Array) -> Residual:
+    """The residual as it would be without the correction, to first order."""
+    return taken_off(residual, terms, -theta)
+
+
+def eliminate(record: Record, state: State, how: Fitting, fixed: int) -> tuple[State, tuple[str, ...]]:
+    """Drop models that no longer earn their place, the weakest first: those that are not significant beside the others,
+    and those without which the others predict held-out blocks as well, or much better if all noise counts alike."""
+    dropped: list[str] = []
+    while len(state.adopted) > max(fixed, 1):
+        assert state.terms is not None
+        blocks, freedom = _blocks(state), state.residual.freedom
+        parts = slices(state)[fixed:]
+        values = [family_p(blocks, state.terms.sensors, list(range(p.start, p.stop))) for p in parts]
+        order = np.arange(state.terms.count)
+        gains = [held_out_gain(blocks, freedom, (order < p.start) | (order >= p.stop)).total for p in parts]
+        rises = [after / before for before, after in (removal(state, fixed + i) for i in range(len(parts)))]
+        if max(values) >= KEEP_ALPHA:
+            weakest = fixed + int(np.argmax(values))
+        elif min(gains) <= 0:
+            weakest = fixed + int(np.argmin(gains))
+        elif max(rises) > 1.0 + WORST_RISE:
+            weakest = fixed + int(np.argmax(rises))
+        else:
+            break
+        dropped.append(state.adopted[weakest].name)
+        rest = [i for i in range(len(state.adopted)) if i != weakest]
+        state = joint_state(record, [state.adopted[i] for i in rest], how, [state.theta[i] for i in rest])
+    return state, tuple(dropped)
