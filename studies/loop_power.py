@@ -48,8 +48,9 @@ from magtensor.loop.assessment import Colours, colours_of, estimated, explained
 from magtensor.loop.colour import Colour
 from magtensor.loop.model import Fitting, Record, State, joint_state
 from magtensor.loop.outcome import why
+from magtensor.loop.overshadowed import traced
 from magtensor.loop.residual import Residual
-from magtensor.loop.search import Search, search
+from magtensor.loop.search import Search
 from magtensor.loop.turned import TurnedColour
 from magtensor.loop.unexplained import unexplained
 from magtensor.registry import Registry
@@ -189,7 +190,7 @@ def tried(trial: Trial) -> dict[str, Any]:
         record = recorded(simulation)
         state = joint_state(record, [], Fitting())
         row["oracle"] = oracle(trial, simulation, record, state)
-        found = search(record, list(models().values()), Fitting())
+        found = traced(record, list(models().values()), Fitting())
     except MagtensorError as error:
         return row | {"outcome": "cannot be", "why": str(error).splitlines()[0]}
     left = unexplained(found, record)

@@ -39,12 +39,13 @@ def _blocks(state: State, colours: Colours | None = None) -> Grams:
     return grams(back, state.terms, noise.across, noise.along, block_count(len(state.residual.affine)))
 
 
-def removal(state: State, index: int) -> tuple[float, float]:
-    """Held-out rms of the residual in nT, all noise alike, without and with one of the adopted models, the others in
+def removal(state: State, *places: int) -> tuple[float, float]:
+    """Held-out rms of the residual in nT, all noise alike, without and with some of the adopted models, the others in
     both."""
     assert state.terms is not None
-    part, order = slices(state)[index], np.arange(state.terms.count)
-    others = (order < part.start) | (order >= part.stop)
+    others = np.ones(state.terms.count, dtype=bool)
+    for place in places:
+        others[slices(state)[place]] = False
     before, after = held_out_gain(_blocks(state, WHITE), state.residual.freedom, others).rms
     return before * state.residual.scale, after * state.residual.scale
 

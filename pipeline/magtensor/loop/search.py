@@ -107,9 +107,7 @@ def search(
         state = with_lines(state, record, lines)
         if len(state.adopted) - len(declared) >= most_effects or state.residual.square() < ROUNDING:
             break
-        taken = {a.name for a in state.adopted}
-        open_ = [m for m in testable if m.name not in taken or repeatable(m)]
-        candidates = candidates_of(state, open_, failed, alpha)
+        candidates = candidates_of(state, open_models(testable, state), failed, alpha)
         adopted = _first_kept(record, standing, candidates, how, len(declared), say)
         steps.append(Step(state, tuple(candidates), *adopted.step))
         if adopted.standing is not None:
@@ -117,7 +115,7 @@ def search(
             standing = replace(adopted.standing, state=state)
             continue
         shared = sought(state, record)
-        if shared is None or hidden is None or NAME in taken:
+        if shared is None or hidden is None or NAME in {a.name for a in state.adopted}:
             break
         shared, source = tried_source(hidden, record, state, shared, how, alpha)
         if source is None:
@@ -223,6 +221,12 @@ def _testable(x: Excitation, models: Sequence[Component]) -> tuple[list[Componen
     """The models whose channels exist, and what the others miss."""
     lacking = {model.name: tuple(missing(model, x)) for model in models}
     return [m for m in models if not lacking[m.name]], {name: lacks for name, lacks in lacking.items() if lacks}
+
+
+def open_models(testable: Sequence[Component], state: State) -> list[Component]:
+    """Those that are not in already, or can be in more than once."""
+    taken = {a.name for a in state.adopted}
+    return [m for m in testable if m.name not in taken or repeatable(m)]
 
 
 def _containing(best: Candidate, possible: Sequence[Candidate], state: State) -> Candidate:

@@ -18,6 +18,7 @@ from magtensor.loop.assessment import WHITE, assess
 from magtensor.loop.changing_matrix import changing_matrices
 from magtensor.loop.direction import direction_series
 from magtensor.loop.excitation import Excitation
+from magtensor.loop.gradient_shape import MODEL, MOSTLY, gradient_share
 from magtensor.loop.latent import shared_words
 from magtensor.loop.model import Record, State, without
 from magtensor.loop.residual import residual_of
@@ -36,8 +37,7 @@ LEAST_FOR_DIRECTION = 60  # samples for each output, at least, before its own po
 def unexplained(found: Search, record: Record) -> dict[str, Any]:
     """The `unexplained` block of the contract."""
     state = found.last
-    residual = state.residual
-    excess = float(np.sqrt(max(residual.square() - 1.0, 0.0)) * residual.scale)
+    excess = excess_rms(state)
     line = strongest_line(state, record)
     turning = predictable_from_direction(state)
     last = found.steps[-1].candidates if found.steps else ()
@@ -54,21 +54,35 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
     if turning > 0:
         words.append(f"{turning:.3g} nT rms of it can be predicted from the direction of the field and how it turns")
     words.extend(one.words for one in changing_matrices(state, ALPHA))
+    gradient = gradient_share(state, record.position)
     if open_ := [c.model.name for c in suspects if c.passes]:
         words.append(f"significant, passes the first two gates of the loop and is not adopted: {', '.join(open_)}")
     if useless := [c.model.name for c in suspects if not c.passes]:
         words.append(f"significant but of no use on held-out blocks: {', '.join(useless)}")
+    shaped = bool(words) and gradient > MOSTLY
+    if shaped:
+        lacks = " and ".join(found.not_tested.get(MODEL, ()))
+        words.append(
+            f"{gradient:.0%} of what differs between the sensors has the shape of a uniform gradient of the field"
+            + (f": {MODEL}, which cannot be tested without {lacks}, would look like this" if lacks else "")
+        )
     if words:
         words.insert(0, f"{excess:.3g} nT rms above the white noise, mostly on {_sensors(state)}")
     if flagged.any():
         words.append(flagged_words(flagged, state, record))
     present = bool(words)
+    untested = [MODEL] if shaped and MODEL in found.not_tested else []
     return {
         "present": present,
         "excess_rms_nT": excess,
         "description": "; ".join(words) if present else NOISE,
-        "looks_like": _looks_like(last) if present else [],
+        "looks_like": untested + _looks_like(last) if present else [],
     }
+
+
+def excess_rms(state: State) -> float:
+    """nT rms of the residual above the white noise."""
+    return float(np.sqrt(max(state.residual.square() - 1.0, 0.0)) * state.residual.scale)
 
 
 def lasting(bad: Mask) -> Mask:

@@ -1,0 +1,66 @@
+"""Whether what differs between the sensors has the shape of a uniform gradient."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from loop_cases import linear_state, loaded, scenario, synthetic
+from numpy.typing import NDArray
+
+from magtensor.loop.gradient_shape import MOSTLY, gradient_share
+
+Array = NDArray[np.float64]
+CROSS = np.array([[0.3, 0, 0], [-0.3, 0, 0], [0, 0.3, 0], [0, -0.3, 0]])
+
+
+def drawn(rng: np.random.Generator, position: Array, samples: int = 1200) -> Array:
+    """(N, S, 3) nT: a gradient tensor drawn anew for every sample, times the positions."""
+    g = rng.standard_normal((samples, 3, 3))
+    g = g + np.swapaxes(g, 1, 2)
+    g -= np.trace(g, axis1=1, axis2=2)[:, None, None] / 3 * np.eye(3)
+    out: Array = 10.0 * np.einsum("nij,sj->nsi", g, position)
+    return out
+
+
+def share_of(added: Array, position: Array | None) -> float:
+    record = replace(synthetic(3, sensors=added.shape[1], added=added), position=position)
+    return gradient_share(linear_state(record), record.position)
+
+
+def test_a_gradient_is_seen_whatever_it_does_in_time() -> None:
+    rng = np.random.default_rng(4)
+    assert share_of(drawn(rng, CROSS), CROSS) > 0.97
+    line = np.linspace(-0.5, 0.5, 4)[:, None] * np.array([1.0, 0.0, 0.0])
+    assert share_of(drawn(rng, line), line) > 0.97
+    assert share_of(drawn(rng, CROSS), CROSS[[2, 0, 3, 1]]) < 0.7  # of an array that stands otherwise
+
+
+def test_errors_of_the_sensors_and_a_single_waveform_have_no_such_shape() -> None:
+    rng = np.random.default_rng(5)
+    assert share_of(3.0 * rng.standard_normal((1200, 4, 3)), CROSS) < 0.7
+    one = 5.0 * np.sin(np.arange(1200) / 7.0)[:, None, None] * (np.diag([1.0, 1.0, -2.0]) @ CROSS.T).T
+    assert share_of(one, CROSS) == 0.0  # whoever makes it
+
+
+@pytest.mark.parametrize("position", [None, CROSS[:2]])
+def test_arrays_that_cannot_tell(position: Array | None) -> None:
+    rng = np.random.default_rng(6)
+    assert share_of(drawn(rng, CROSS[:2]), position) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("effect", "shaped"),
+    [
+        ({"type": "site_gradient", "rms_nT": 0.5}, True),
+        ({"type": "temperature_scale", "rms_nT": 0.5}, False),
+        ({"type": "eddy_current", "rms_nT": 0.5}, False),
+        ({"type": "nonlinearity_quadratic", "rms_nT": 0.5}, False),
+    ],
+)
+def test_effects_of_a_simulated_survey(effect: dict[str, Any], shaped: bool, tmp_path: Path) -> None:
+    record = loaded(tmp_path, scenario(5, effect))
+    assert (gradient_share(linear_state(record), record.position) > MOSTLY) is shaped

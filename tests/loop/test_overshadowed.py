@@ -1,0 +1,58 @@
+"""What is small beside something larger that nobody named, and follows the attitude as that does, is not adopted."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from loop_cases import adopted_names, loaded, scenario, verdict_of
+
+from magtensor.loop.model import Adopted, Fitting, joint_state
+from magtensor.loop.overshadowed import attitude_share
+from magtensor.registry import Registry
+
+MODELS = ("nonlinearity_quadratic", "nonlinearity_cubic", "eddy_current", "current_field", "site_gradient")
+
+
+def gradient(rms_nT: float) -> dict[str, Any]:
+    """Of the site, whose attitude nobody logs here."""
+    return {"type": "site_gradient", "rms_nT": rms_nT}
+
+
+@pytest.mark.parametrize("seed", [21, 22])
+def test_a_gradient_without_attitude_is_no_nonlinearity(seed: int, tmp_path: Path) -> None:
+    told = verdict_of(tmp_path, scenario(seed, gradient(0.6)), models=MODELS)
+    assert adopted_names(told) == set()
+    assert {n["error_model"]: n["missing"] for n in told["not_tested"]} == {"site_gradient": ["attitude"]}
+    assert told["unexplained"]["present"] and told["unexplained"]["excess_rms_nT"] > 0.4
+    assert told["unexplained"]["looks_like"][0] == "site_gradient"
+    assert "cannot be tested without attitude" in told["unexplained"]["description"]
+    why = {r["error_model"]: r["why"] for r in told["rejected"]}["nonlinearity_quadratic"]
+    assert "follows the attitude" in why and "nT that stay" in why
+    assert told["steps"][0]["adopted"] == "nonlinearity_quadratic" and told["steps"][-1]["refused"]  # what it is about
+
+
+def test_larger_effects_and_those_that_do_not_follow_the_attitude_are_kept_beside_it(tmp_path: Path) -> None:
+    effects = (
+        {"type": "nonlinearity_cubic", "rms_nT": 4.0},
+        {"type": "current_field", "channel": "current_heater", "rms_nT": 0.3},
+        gradient(0.8),
+    )
+    told = verdict_of(tmp_path, scenario(23, *effects), models=MODELS)
+    assert adopted_names(told) == {"nonlinearity_cubic", "current_field"}
+    assert told["unexplained"]["present"] and told["unexplained"]["excess_rms_nT"] > 0.5
+
+
+def test_how_much_of_an_effect_follows_the_attitude(tmp_path: Path) -> None:
+    effects = [
+        {"type": "eddy_current", "rms_nT": 1.0},
+        {"type": "current_field", "channel": "current_heater", "rms_nT": 1.0},
+    ]
+    record = loaded(tmp_path, scenario(24, *effects))
+    registry = Registry.load()
+    settings = {"eddy_current": {}, "current_field": {"channel": "current_heater"}}
+    adopted = [Adopted(registry.find("error_model", n), s) for n, s in settings.items()]
+    state = joint_state(record, adopted, Fitting())
+    assert attitude_share(state, [0]) > 0.95
+    assert attitude_share(state, [1]) < 0.1
