@@ -57,7 +57,7 @@ class SlowModes:
         """(3 K, Q) products of (N, Q) with each cosine times response, three for each cosine, the slowest first."""
         from scipy.fft import dct
 
-        sums = np.einsum("bsj,bsq->bjq", self._held, self._in_steps(series))
+        sums = self._held.transpose(0, 2, 1) @ self._in_steps(series)
         out: Array = dct(sums, axis=0)[1 : self.most + 1] / np.sqrt(2.0 * len(series))
         return out.reshape(3 * self.most, -1)
 
@@ -68,7 +68,7 @@ class SlowModes:
         k, q, n = len(coefficients) // 3, coefficients.shape[1], len(self.response)
         spectrum = np.zeros((len(self._held), 3, q))
         spectrum[1 : k + 1] = coefficients.reshape(k, 3, q) / np.sqrt(2.0 * n)
-        out: Array = np.einsum("bsj,bjq->bsq", self._held, dct(spectrum, axis=0, type=3)).reshape(-1, q)
+        out: Array = (self._held @ dct(spectrum, axis=0, type=3)).reshape(-1, q)
         return out[:n]
 
     @cached_property
@@ -77,7 +77,7 @@ class SlowModes:
         from scipy.fft import dct
 
         k = self.most
-        products = np.einsum("bsi,bsj->bij", self._held, self._held)
+        products = self._held.transpose(0, 2, 1) @ self._held
         sums = dct(products, axis=0)[: 2 * k + 1] / 2.0
         order = np.arange(1, k + 1)
         pairs = sums[np.abs(order[:, None] - order)] + sums[order[:, None] + order]
