@@ -133,8 +133,11 @@ def _rejected(found: Search) -> list[dict[str, Any]]:
 def why(candidate: Candidate, winner: Candidate | None) -> str:
     """Why a candidate was not adopted in its round."""
     gain = candidate.assessment.gain
-    figures = f"p {candidate.adjusted_p:.2g} after correction, held-out gain {gain.total:.4g} (t {gain.t:.2g})"
-    if candidate.adjusted_p >= candidate.alpha:
+    p = f"p {candidate.adjusted_p:.2g} after correction"
+    if candidate.significant and candidate.adjusted_p >= candidate.alpha:
+        p += f" by blocks, {candidate.adjusted_null_p:.2g} in noise of the residual's own colour"
+    figures = f"{p}, held-out gain {gain.total:.4g} (t {gain.t:.2g})"
+    if not candidate.significant:
         return f"not significant: {figures}"
     if candidate.of_the_log and candidate.log_noise > 0:
         return f"noise in the log of its channel, which another model brought in, explains as much: {figures}"

@@ -30,6 +30,8 @@ from magtensor.loop.settings import EventTimes, Range
 from magtensor.loop.terms import Terms, joined
 
 ALPHA = 0.005  # family-wise probability that a clean survey gets an adoption, before the second gate
+ALONE = 1e-3  # probability that a single test by blocks is passed, which bears noise's own colour out
+UNLIKELY = 0.02  # of the family-wise probability: asked for in noise of the residual's own colour
 LEAST_REDUCTION = 1e-4  # of the held-out sum of squares: smaller is significant only in very long surveys
 LOG_MARGIN = 1.5  # the noise of a log is known to some per cent, and a dozen coefficients gain a little by chance
 SCREENED = 8  # models looked at closely in each round
@@ -71,6 +73,19 @@ class Candidate:
         return 0.0 < self.assessment.gain.total <= LOG_MARGIN * self.log_noise
 
     @property
+    def significant(self) -> bool:
+        """Whether noise does not explain it, all that was tried considered.
+
+        By the scatter over blocks alone; or, because a dozen long blocks tell little of what is very unlikely, in noise
+        of the colour that the residual has without the model, in which it then predicts held-out blocks as well, if the
+        blocks bear it out as a single test.
+        """
+        if self.adjusted_p < self.alpha:
+            return True
+        unlikely = self.adjusted_null_p < UNLIKELY * self.alpha and self.assessment.null_gain.total > 0
+        return unlikely and self.assessment.p < ALONE
+
+    @property
     def beyond_slow_noise(self) -> bool:
         """Whether noise of the colour that the residual has without the model, all of it taken for noise, does not
         explain what the model does: it predicts held-out blocks even so, or that much would be too unlikely.
@@ -87,7 +102,7 @@ class Candidate:
             return False
         gain = self.assessment.gain
         reduction = gain.total / max(float(gain.before.sum()), 1e-300)
-        return self.adjusted_p < self.alpha and gain.consistent and reduction > LEAST_REDUCTION
+        return self.significant and gain.consistent and reduction > LEAST_REDUCTION
 
     @property
     def passes(self) -> bool:

@@ -41,7 +41,7 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
     line = strongest_line(state, record)
     turning = predictable_from_direction(state)
     last = found.steps[-1].candidates if found.steps else ()
-    seen = [c for c in last if c.adjusted_p < c.alpha and c.adjusted_null_p < ALPHA]
+    seen = [c for c in last if c.passes or (c.adjusted_p < c.alpha and c.adjusted_null_p < ALPHA)]
     flagged = lasting(~state.fit.keep)
     if flagged.any():  # while effects were sought, what lasts was believed
         seen = [c for c in seen if _still_significant(c, state)]
