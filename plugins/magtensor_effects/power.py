@@ -27,8 +27,8 @@ def current_field(
     channel: Annotated[str, CURRENT, Field(description="current channel; '': the only one")] = "",
     lag_s: Annotated[
         float,
-        Range(0.0, 10.0, count=6, spacing="log"),
-        Field(ge=0, description="time constant of the current behind the logged one, s"),
+        Range(-2.0, 10.0, count=6, spacing="log"),
+        Field(description="time constant of the current behind the logged one, s; below 0 the log is so much late"),
     ] = 0.0,
 ) -> Terms:
     """The magnetic field of a logged current: a constant vector at each sensor, in proportion to it.

@@ -139,4 +139,4 @@ def _sought_anew(state: State, number: int, name: str) -> float:
         return score(changed.terms(state.excitation).at(state.residual.samples))
 
     here = float(now.settings[name])
-    return golden(gain, here * (1 - POLISH), here * (1 + POLISH), here)
+    return golden(gain, here - POLISH * abs(here), here + POLISH * abs(here), here)

@@ -166,7 +166,12 @@ class Excitation:
         return full(self.field.reshape(len(self.time), -1) @ solver.T)
 
     def lagged(self, series: Array, tau: float) -> Array:
-        """As `relaxed`, but straight across gaps: for what goes on between recordings, such as a temperature."""
+        """As `relaxed`, but straight across gaps: for what goes on between recordings, such as a temperature.
+
+        A tau below 0 is the delay of a log that is late, and the series (N,) is taken so much later; held at the end.
+        """
+        if tau < 0:
+            return np.interp(self.time - tau, self.time, series)
         return _first_order(self.time, np.asarray(series, dtype=float), tau) if tau > 0 else series
 
     def relaxed(self, series: Array, tau: float) -> Array:

@@ -124,7 +124,7 @@ def repeatable(model: Component) -> bool:
 
 def _of_ratios(grid: Any) -> bool:
     """A setting whose values differ by factors: a time constant, lag or width."""
-    return isinstance(grid, Range) and grid.low >= 0
+    return isinstance(grid, Range) and (grid.low >= 0 or grid.spacing == "log")
 
 
 def profiled(model: Component) -> dict[str, Any]:
@@ -336,7 +336,7 @@ def _already(state: State, model: Component, settings: Mapping[str, Any]) -> boo
 
 
 def _apart(one: float, other: float) -> bool:
-    return max(one, other) > LEAST_RATIO * min(one, other)
+    return abs(one - other) > (LEAST_RATIO - 1.0) * min(abs(one), abs(other))
 
 
 def _terms(model: Component, settings: Mapping[str, Any], x: Excitation, failed: dict[str, str]) -> Terms | None:
@@ -375,7 +375,7 @@ def _refined(model: Component, settings: dict[str, Any], state: State, failed: d
             return -np.inf if found is None else score(found.at(few[0].samples))
 
         best = golden(gain, low, high, settings[name])
-        if low == 0.0 and gain(best) - gain(0.0) < SEPARATION / 2.0:
+        if low <= 0.0 <= high and _of_ratios(grid) and gain(best) - gain(0.0) < SEPARATION / 2.0:
             best = 0.0
         settings = {**settings, name: best}
     return settings

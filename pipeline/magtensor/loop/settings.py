@@ -22,7 +22,8 @@ class Range:
     Attributes:
         low, high: the limits.
         count: how many are tried before the best is refined between its neighbours.
-        spacing: "linear" or "log" (with 0 added in front where `low` is 0).
+        spacing: "linear" or "log" (with 0 added in front where `low` is 0, and where it is below 0 the same on the
+            other side, beyond `count`).
         of_duration: the limits are fractions of the survey's duration.
         sampled: nothing shorter than the time between samples is tried, which no sample would show.
     """
@@ -45,7 +46,7 @@ class Range:
             return [float(v) for v in np.linspace(low, high, self.count)]
         first = low if low > 0 else high / 10 ** (self.count / 4)
         grid = [float(v) for v in np.geomspace(first, high, self.count - (low <= 0))]
-        return [0.0, *grid] if low <= 0 else grid
+        return [-v for v in grid[::-1] if v <= -low] + [0.0, *grid] if low <= 0 else grid
 
 
 @dataclass(frozen=True)
