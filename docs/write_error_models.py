@@ -48,7 +48,8 @@ every recipe.
   two will do.
 - `pointwise=True` says that its regressors at a sample follow from that sample alone; settings with many values are
   then searched faster. `agrees=function(settings, coefficients)` says whether fitted coefficients are what the settings
-  assume, where both mean one thing; the loop adopts nothing of which they are not.
+  assume, where both mean one thing; the loop adopts nothing of which they are not. `about=function(settings,
+  coefficients)` gives the settings about which a model that is linear only nearby is to be made for such coefficients.
 
 `check_error_model(my_model)` of `magtensor.loop.checker` gives a list of everything that is wrong with it; put
 `assert check_error_model(my_model) == []` into your tests.

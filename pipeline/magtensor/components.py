@@ -80,6 +80,7 @@ class Component:
     typical: str = ""  # of an error model: its usual magnitude
     pointwise: bool = False  # of an error model: its regressors at a sample need no other sample
     agrees: Callable[[Mapping[str, Any], Any], bool] | None = None  # of an error model: settings and coefficients
+    about: Callable[[Mapping[str, Any], Any], Mapping[str, Any]] | None = None  # settings that coefficients ask for
     several: bool = False  # of a stage: it also fits the further surveys that a recipe names
     long: Callable[..., Any] | None = None  # of a stage: what it does with a recording longer than the memory
 
@@ -264,6 +265,7 @@ def error_model(
     typical: str = "",
     pointwise: bool = False,
     agrees: Callable[[Mapping[str, Any], Any], bool] | None = None,
+    about: Callable[[Mapping[str, Any], Any], Mapping[str, Any]] | None = None,
 ) -> Callable[[F], F]:
     """Mark ``function(x: Excitation, *, settings) -> Terms`` as an error model.
 
@@ -279,11 +281,13 @@ def error_model(
             few samples only, without the others being computed.
         agrees: of settings and fitted coefficients (P,), whether they are what they must be to each other; the loop
             adopts nothing of which they are not.
+        about: of settings and fitted coefficients (P,), the settings about which a model that is linear only nearby
+            has to be made for such coefficients; the loop moves there where the data allow it.
     """
     _with_parentheses("error_model", effect)
     return _mark(
         "error_model", name, declares=Declares(tuple(needs)), effect=effect, source=source, typical=typical,
-        pointwise=pointwise, agrees=agrees,
+        pointwise=pointwise, agrees=agrees, about=about,
     )  # fmt: skip
 
 

@@ -15,6 +15,7 @@ from magtensor.loop.terms import Terms, joined
 from magtensor_effects.ageing import EventTime, Order, Span, courses
 
 NEARBY_S = 2.0  # shorter delays show as the slope over this time
+LONGEST_S = 120.0
 BETWEEN_NOISE_AND_DELAY = 0.75  # of the lag: half of it is what noise makes, all of it a delay
 
 
@@ -49,10 +50,15 @@ def _delayed_by_its_lag(settings: Mapping[str, Any], coefficients: Array) -> boo
     return abs(lag) < NEARBY_S or coefficients[0] / lag > BETWEEN_NOISE_AND_DELAY
 
 
+def _about_its_delay(settings: Mapping[str, Any], coefficients: Array) -> dict[str, Any]:
+    return {**settings, "lag_s": float(np.clip(coefficients[0], -LONGEST_S, LONGEST_S))}
+
+
 @error_model(
     "reference",
     needs=("total_field",),
     agrees=_delayed_by_its_lag,
+    about=_about_its_delay,
     source="shift in time",
     typical="a leap second, a time zone, or the station's own filter; 0.1 nT for 1 s in a 10 nT pulsation of 10 min",
 )
@@ -61,7 +67,7 @@ def reference_clock(
     *,
     lag_s: Annotated[
         float,
-        Range(-120.0, 120.0, count=17),
+        Range(-LONGEST_S, LONGEST_S, count=17),
         Field(description="delay about which it is linear, s: positive where the stamps are late"),
     ] = 0.0,
 ) -> Terms:

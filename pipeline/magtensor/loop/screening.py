@@ -16,6 +16,7 @@ from magtensor.loop.assessment import (
     Assessment,
     assess,
     colours_of,
+    estimated,
     likeliest,
 )
 from magtensor.loop.evidence import Whitened
@@ -40,6 +41,7 @@ LEAST_RATIO = 2.0  # of the time constants, lags or widths of a model adopted tw
 HOPELESS = 0.5  # corrected p value in the kinder of two colours of noise
 SCREENING_SAMPLES = 2000  # settings are profiled on so many samples
 REFINING_SAMPLES = 6000  # and the best of them refined on so many
+MOST_OF_IT = 0.75  # of what a model explains, if it is to be made about other settings
 _REFINEMENTS = 8
 
 
@@ -378,7 +380,37 @@ def _refined(model: Component, settings: dict[str, Any], state: State, failed: d
         if low <= 0.0 <= high and _of_ratios(grid) and gain(best) - gain(0.0) < SEPARATION / 2.0:
             best = 0.0
         settings = {**settings, name: best}
-    return settings
+    return _about_what_it_fits(model, settings, state, failed) if model.about is not None else settings
+
+
+def _about_what_it_fits(
+    model: Component, settings: dict[str, Any], state: State, failed: dict[str, str]
+) -> dict[str, Any]:
+    """Settings about which a model is linear, moved to where its coefficients are, unless it explains far less there.
+
+    In white noise: what is slow determines such coefficients, and the noise of the regressors themselves is fast. Of a
+    delay, the lag that it is sought about hardly matters; if it matters, it is noise of the regressor.
+    """
+    residual, given = _thinned(state, REFINING_SAMPLES)
+    score = Scorer(residual, given, WHITE)
+
+    def at(settings: Mapping[str, Any]) -> Terms | None:
+        terms = _terms(model, settings, state.excitation, failed)
+        return None if terms is None else terms.at(residual.samples)
+
+    first = terms = at(settings)
+    assert model.about is not None
+    moved = settings
+    for _ in range(_REFINEMENTS):
+        if terms is None:
+            return settings
+        together = terms if given is None else joined([given, terms])
+        theta = estimated(residual, together, WHITE).theta[together.count - terms.count :]
+        moved, before = dict(model.about(moved, theta)), moved
+        if moved == before:
+            break
+        terms = at(moved)
+    return moved if first is not None and terms is not None and score(terms) >= MOST_OF_IT * score(first) else settings
 
 
 def _thinned(state: State, most: int) -> tuple[Residual, Terms | None]:

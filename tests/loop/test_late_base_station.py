@@ -1,0 +1,37 @@
+"""A base station whose stamps are late: the delay is found whatever lag it is sought about first."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from loop_cases import scenario, verdict_of
+
+SEARCHED = ["reference_clock", "reference_scale", "reference_drift", "passing_source", "offset_drift", "scale_drift"]
+
+
+@pytest.mark.parametrize(("delay_s", "seed"), [(12.0, 41), (-45.0, 42)])
+def test_the_delay_is_found_and_the_lag_is_the_delay(delay_s: float, seed: int, tmp_path: Path) -> None:
+    def late(path: Path) -> None:
+        with h5py.File(path, "a") as file:
+            file["reference/time"][:] = file["reference/time"][:] + delay_s
+
+    told = verdict_of(tmp_path, scenario(seed), late, SEARCHED)
+    assert [a["error_model"] for a in told["adopted"]] == ["reference_clock"], told["unexplained"]["description"]
+    found = told["adopted"][0]
+    delay = found["coefficients"][0]
+    assert delay["value"] == pytest.approx(delay_s, abs=max(4 * delay["std"], 0.03 * abs(delay_s)))
+    assert found["settings"]["lag_s"] == pytest.approx(delay["value"], rel=0.15)
+
+
+def test_slow_noise_of_the_base_station_is_no_delay(tmp_path: Path) -> None:
+    def wandering(path: Path) -> None:
+        rng = np.random.default_rng(3)
+        with h5py.File(path, "a") as file:
+            field = file["reference/total_field"]
+            field[:] = field[:] + 0.1 * np.cumsum(rng.standard_normal(len(field)))
+
+    told = verdict_of(tmp_path, scenario(43), wandering, ["reference_clock", "offset_drift"])
+    assert "reference_clock" not in {a["error_model"] for a in told["adopted"]}
