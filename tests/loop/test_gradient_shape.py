@@ -11,7 +11,7 @@ import pytest
 from loop_cases import linear_state, loaded, scenario, synthetic
 from numpy.typing import NDArray
 
-from magtensor.loop.gradient_shape import MOSTLY, gradient_share
+from magtensor.loop.gradient_shape import gradient_share
 
 Array = NDArray[np.float64]
 CROSS = np.array([[0.3, 0, 0], [-0.3, 0, 0], [0, 0.3, 0], [0, -0.3, 0]])
@@ -36,14 +36,18 @@ def test_a_gradient_is_seen_whatever_it_does_in_time() -> None:
     assert share_of(drawn(rng, CROSS), CROSS) > 0.97
     line = np.linspace(-0.5, 0.5, 4)[:, None] * np.array([1.0, 0.0, 0.0])
     assert share_of(drawn(rng, line), line) > 0.97
-    assert share_of(drawn(rng, CROSS), CROSS[[2, 0, 3, 1]]) < 0.7  # of an array that stands otherwise
+    assert share_of(drawn(rng, CROSS), CROSS[[2, 0, 3, 1]]) == 0.0  # of an array that stands otherwise
 
 
 def test_errors_of_the_sensors_and_a_single_waveform_have_no_such_shape() -> None:
     rng = np.random.default_rng(5)
-    assert share_of(3.0 * rng.standard_normal((1200, 4, 3)), CROSS) < 0.7
+    assert share_of(3.0 * rng.standard_normal((1200, 4, 3)), CROSS) == 0.0
     one = 5.0 * np.sin(np.arange(1200) / 7.0)[:, None, None] * (np.diag([1.0, 1.0, -2.0]) @ CROSS.T).T
     assert share_of(one, CROSS) == 0.0  # whoever makes it
+    triangle = np.array([[0.3, 0, 0], [-0.15, 0.26, 0], [-0.15, -0.26, 0]])  # it leaves one direction of six
+    noisy = np.zeros((1200, 3, 3))
+    noisy[:, 1] = 0.3 * np.cumsum(np.random.default_rng(7).standard_normal((1200, 3)), axis=0)
+    assert share_of(noisy, triangle) == 0.0
 
 
 @pytest.mark.parametrize("position", [None, CROSS[:2]])
@@ -63,4 +67,4 @@ def test_arrays_that_cannot_tell(position: Array | None) -> None:
 )
 def test_effects_of_a_simulated_survey(effect: dict[str, Any], shaped: bool, tmp_path: Path) -> None:
     record = loaded(tmp_path, scenario(5, effect))
-    assert (gradient_share(linear_state(record), record.position) > MOSTLY) is shaped
+    assert (gradient_share(linear_state(record), record.position) > 0.9) is shaped

@@ -14,13 +14,14 @@ from magtensor.calibration.types import Array
 from magtensor.loop.model import State
 
 MODEL = "site_gradient"
-MOSTLY = 0.9  # of the variance above the white noise
+MOST_OUTSIDE = 0.1  # of the variance of each of its directions: what any other direction holds at most
 LEAST_SECOND = 0.05  # of the strongest direction: a single waveform of any source has but one
+BEYOND_CHANCE = 5.0  # standard deviations of the white noise's own variance
 _RANK = 1e-6
 
 
 def gradient_share(state: State, position: Array | None) -> float:
-    """The part of the residual's variance across, above the white noise, that a uniform gradient can make.
+    """The part of the residual's variance across, above the white noise, that a uniform gradient makes.
 
     Parameters
     ----------
@@ -28,7 +29,7 @@ def gradient_share(state: State, position: Array | None) -> float:
 
     Returns
     -------
-    Within 0 and 1; 0 where the array cannot tell, or where one waveform would do.
+    Within 0 and 1; 0 where the array cannot tell, where one waveform would do, or where other directions hold too much.
     """
     residual = state.residual
     if position is None or residual.across is None:
@@ -45,9 +46,12 @@ def gradient_share(state: State, position: Array | None) -> float:
     white = state.colours.across.white
     inside = np.linalg.eigvalsh(directions.T @ covariance @ directions) - white
     total, of_gradient = float(np.trace(covariance)) - most * white, float(inside.sum())
-    if of_gradient <= 0 or inside[-2] < LEAST_SECOND * inside[-1]:
+    each_outside, each_inside = (total - of_gradient) / (most - held), of_gradient / held
+    if of_gradient < BEYOND_CHANCE * white * np.sqrt(2.0 * held / n):
         return 0.0
-    return float(np.clip(of_gradient / max(total, 1e-300), 0.0, 1.0))
+    if each_outside > MOST_OUTSIDE * each_inside or inside[-2] < LEAST_SECOND * inside[-1]:
+        return 0.0
+    return min(of_gradient / total, 1.0)
 
 
 def _symmetric() -> Array:

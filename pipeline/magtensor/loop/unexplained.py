@@ -18,7 +18,7 @@ from magtensor.loop.assessment import WHITE, assess
 from magtensor.loop.changing_matrix import changing_matrices
 from magtensor.loop.direction import direction_series
 from magtensor.loop.excitation import Excitation
-from magtensor.loop.gradient_shape import MODEL, MOSTLY, gradient_share
+from magtensor.loop.gradient_shape import MODEL, gradient_share
 from magtensor.loop.latent import shared_words
 from magtensor.loop.model import Record, State, without
 from magtensor.loop.residual import residual_of
@@ -59,7 +59,7 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
         words.append(f"significant, passes the first two gates of the loop and is not adopted: {', '.join(open_)}")
     if useless := [c.model.name for c in suspects if not c.passes]:
         words.append(f"significant but of no use on held-out blocks: {', '.join(useless)}")
-    shaped = bool(words) and gradient > MOSTLY
+    shaped = bool(words) and gradient > 0
     if shaped:
         lacks = " and ".join(found.not_tested.get(MODEL, ()))
         words.append(
