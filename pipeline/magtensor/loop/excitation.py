@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from magtensor.calibration.types import Array
 from magtensor.errors import did_you_mean
-from magtensor.loop.quiet import quieted
+from magtensor.loop.held import unheld
 from magtensor.loop.terms import REFERENCE, Terms
 
 AXES = "xyz"
@@ -103,10 +103,11 @@ class Excitation:
         return self.logged[name]
 
     def thermometer(self, name: str) -> Array:
-        """A logged temperature without the noise of its log: what has a thermal mass does not jump between samples."""
+        """A logged temperature without the noise of its log: what has a thermal mass does not jump, neither between
+        samples nor where a log that is written seldom has a new value."""
         if name not in self._quiet:
             values = self.channel(name)
-            columns = [quieted(column) for column in values.reshape(len(values), -1).T]
+            columns = [unheld(self.time, column) for column in values.reshape(len(values), -1).T]
             self._quiet[name] = np.column_stack(columns).reshape(values.shape)
         return self._quiet[name]
 
