@@ -102,7 +102,8 @@ def sentence(outcome: dict[str, Any]) -> str:
         head = f"Calibrated with {model}; a residual remains that no known effect explains"
     else:
         head = f"Calibrated with {model}; nothing is left that asks for another effect"
-    tail = f"; unexplained: {left['description']}" if left["present"] else ""
+    slow = str(left["description"] or "").partition("; ")[2] if left["present"] is False else ""
+    tail = f"; unexplained: {left['description']}" if left["present"] else f"; of what is left {slow}" if slow else ""
     doubt = outcome.get("calibration", {}).get("description", "")
     return f"{head}: {told}{tail}{_disagreement(outcome)}{f'; {doubt}' if doubt else ''}."
 

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 
 from magtensor.calibration.types import Mask
-from magtensor.loop.assessment import WHITE, assess
+from magtensor.loop.assessment import WHITE, Colours, assess, block_count
 from magtensor.loop.changing_matrix import changing_matrices
-from magtensor.loop.direction import direction_series
+from magtensor.loop.direction import attitude_series, direction_series
 from magtensor.loop.excitation import Excitation
 from magtensor.loop.gradient_shape import MODEL, gradient_share
 from magtensor.loop.latent import shared_words
@@ -25,12 +25,14 @@ from magtensor.loop.residual import residual_of
 from magtensor.loop.screening import Candidate
 from magtensor.loop.search import Search
 from magtensor.loop.spectrum import spectral_lines
-from magtensor.loop.terms import Terms
+from magtensor.loop.statistics import Gain, held_out_gain
+from magtensor.loop.terms import Terms, joined
 
 LONGEST_SPIKE = 2  # samples: what lasts longer is no accident of the recording
 ALPHA = 0.001  # of each of the tests
 NOISE = "what is left is noise: white, and slow noise of each sensor alone or of the reference"
 LEAST_T = 4.5  # one in a thousand by chance: paired t over folds of what the direction predicts
+MOSTLY = 0.9  # of what outputs of their own explain: if the total field alone does that, it is the total field
 LEAST_FOR_DIRECTION = 60  # samples for each output, at least, before its own polynomial can be asked for
 
 
@@ -39,7 +41,6 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
     state = found.last
     excess = excess_rms(state)
     line = strongest_line(state, record)
-    turning = predictable_from_direction(state)
     last = found.steps[-1].candidates if found.steps else ()
     seen = [c for c in last if c.passes or (c.adjusted_p < c.alpha and c.adjusted_null_p < ALPHA)]
     flagged = lasting(~state.fit.keep)
@@ -51,8 +52,7 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
         words.append(shared_words(found.shared, record.sensors))
     if line is not None:
         words.append(f"a line at {line[0]:.4g} Hz (period {1 / line[0]:.4g} s), {line[1]:.3g} nT rms")
-    if turning > 0:
-        words.append(f"{turning:.3g} nT rms of it can be predicted from the direction of the field and how it turns")
+    words.extend(attitude_words(state))
     words.extend(one.words for one in changing_matrices(state, ALPHA))
     gradient = gradient_share(state, record.position)
     if open_ := [c.model.name for c in suspects if c.passes]:
@@ -75,9 +75,39 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
     return {
         "present": present,
         "excess_rms_nT": excess,
-        "description": "; ".join(words) if present else NOISE,
+        "description": "; ".join(words) if present else noise_words(state),
         "looks_like": untested + _looks_like(last) if present else [],
     }
+
+
+def attitude_words(state: State) -> list[str]:
+    """What of the residual the attitude predicts: in the outputs, or in the total field alone where that does."""
+    turning, moving = predictable_from_direction(state), predictable_in_the_total_field(state)
+    if moving > 0 and moving > MOSTLY * turning:
+        spread = np.sqrt(state.residual.freedom * np.mean(state.residual.reference_gain**-2.0))  # nT, of |b| - F
+        return [
+            f"{moving * spread:.3g} nT rms of |b| - F, in all sensors alike, can be predicted from the attitude: the "
+            "field may change as the array moves"
+        ]
+    amount = turning * state.residual.scale
+    words = f"{amount:.3g} nT rms of it can be predicted from the direction of the field and how it turns"
+    return [words] if turning > 0 else []
+
+
+def noise_words(state: State) -> str:
+    """What is left where nothing is unexplained, and how much of it is no white noise where that is the larger part."""
+    across, along = state.residual.across, state.residual.along
+    words = [NOISE]
+    if across is not None:
+        beyond = float(np.sum(across**2)) / (len(across) * (state.residual.freedom - (along is not None))) - 1.0
+        if beyond > 1.0:
+            words.append(
+                f"{np.sqrt(beyond) * state.residual.scale:.3g} nT rms is not white, mostly on {_sensors(state)}"
+            )
+    if along is not None and np.mean(along**2) > 2.0:
+        rms = np.sqrt(np.mean((along**2 - 1.0) / state.residual.reference_gain**2))
+        words.append(f"{rms:.3g} nT rms of |b| - F is not white")
+    return "; ".join(words)
 
 
 def excess_rms(state: State) -> float:
@@ -125,21 +155,37 @@ def flagged_words(flagged: Mask, state: State, record: Record) -> str:
 
 
 def predictable_from_direction(state: State) -> float:
-    """nT rms of the residual that follows the field's direction and its rate of change, whatever the law; 0 if none.
+    """The part of the whitened residual, rms, that follows the field's direction and its rate of change; 0 if none.
 
     Any smooth effect of attitude, named or not, is a polynomial of the direction to first order: second and third
     degree and the rate of change, with coefficients of every output's own, are fitted on some blocks and judged on
     others. Noise makes such a model worse than none.
     """
-    from magtensor.loop.assessment import Colours, block_count
-    from magtensor.loop.evidence import grams
-    from magtensor.loop.statistics import Gain, held_out_gain
-    from magtensor.loop.terms import joined
-
-    residual, x = state.residual, state.excitation
-    if len(residual.affine) < LEAST_FOR_DIRECTION * 3 * len(x.sensors):
+    if len(state.residual.affine) < LEAST_FOR_DIRECTION * 3 * len(state.excitation.sensors):
         return 0.0
-    terms = _direction_terms(x).at(residual.samples)
+    return _predictable(state, _direction_terms(state.excitation))
+
+
+def predictable_in_the_total_field(state: State) -> float:
+    """The part of the whitened residual, rms, that the attitude predicts as a change of the total field; 0 if none.
+
+    The same for what no sensor feels alone: polynomials of the direction, and of attitudes and accelerations where they
+    are logged, added to the reference.
+    """
+    series = attitude_series(state.excitation)
+    if state.residual.along is None or len(state.residual.affine) < LEAST_FOR_DIRECTION * series.shape[1]:
+        return 0.0
+    each = [state.excitation.on_reference(column, "nT", str(number)) for number, column in enumerate(series.T)]
+    return _predictable(state, joined(each))
+
+
+def _predictable(state: State, terms: Terms) -> float:
+    """The part of the whitened residual, rms over all its values, that terms at all samples predict on blocks that they
+    were not fitted to; 0 if none."""
+    from magtensor.loop.evidence import grams
+
+    residual = state.residual
+    terms = terms.at(residual.samples)
     given = 0
     if state.terms is not None:
         given = state.terms.count
@@ -154,7 +200,7 @@ def predictable_from_direction(state: State) -> float:
     if gain.total <= 0 or gain.t < LEAST_T:
         return 0.0
     before, after = gain_in(WHITE).rms  # seen through the filter the amount would be too small
-    return float(np.sqrt(max(before**2 - after**2, 0.0)) * residual.scale)
+    return float(np.sqrt(max(before**2 - after**2, 0.0)))
 
 
 def _direction_terms(x: Excitation) -> Terms:

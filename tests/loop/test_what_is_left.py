@@ -1,0 +1,44 @@
+"""What the verdict says of a residual that no error model explains."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from loop_cases import Array, linear_state, synthetic
+
+from magtensor.loop.model import Fitting
+from magtensor.loop.search import search
+from magtensor.loop.unexplained import NOISE, predictable_in_the_total_field, unexplained
+
+
+def cubed(raw: Array) -> Array:
+    """(N,) the third power of the field's direction along the first axis."""
+    b = raw[:, 0] - raw[:, 0].mean(axis=0)
+    return np.asarray((b[:, 0] / np.linalg.norm(b, axis=1)) ** 3)
+
+
+def test_a_site_whose_field_changes_as_the_array_moves_is_told() -> None:
+    record = synthetic(5, samples=2400)
+    moved = replace(record, total_field=record.total_field + 6.0 * cubed(record.raw))
+    assert predictable_in_the_total_field(linear_state(moved)) > 0
+    assert predictable_in_the_total_field(linear_state(record)) == 0.0
+    told = unexplained(search(moved, [], Fitting()), moved)
+    assert told["present"] and "as the array moves" in told["description"]
+    amount = float(re.findall(r"([\d.]+) nT rms of \|b\| - F", told["description"])[0])
+    # of x^3 on a sphere, of mean square 1/7, an offset takes off 0.6 x
+    assert amount == pytest.approx(6.0 * np.sqrt(1 / 7 - 0.36 / 3), rel=0.15)
+
+
+def test_slow_noise_is_no_effect_but_its_amount_is_told() -> None:
+    rng = np.random.default_rng(6)
+    added = np.zeros((1200, 4, 3))
+    added[:, 2] = 0.2 * np.cumsum(rng.standard_normal((1200, 3)), axis=0)
+    record = synthetic(6, added=added)
+    told = unexplained(search(record, [], Fitting()), record)
+    assert not told["present"]
+    assert told["description"].startswith(NOISE) and "is not white, mostly on S3" in told["description"]
+    quiet = synthetic(6)
+    assert unexplained(search(quiet, [], Fitting()), quiet)["description"] == NOISE
