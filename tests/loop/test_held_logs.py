@@ -50,7 +50,7 @@ def test_a_temperature_offset_keeps_its_lag_and_needs_no_helper(held: bool, tmp_
             logged[:] = values[np.arange(len(values)) // HELD * HELD]
 
     effect = {"type": "temperature_offset", "rms_nT": 2.0, "lag_s": 50.0}
-    models = ["temperature_offset", "channel_response", "latent_source", "warm_up", "offset_drift"]
+    models = ["temperature_offset", "latent_source", "offset_drift"]
     told = verdict_of(tmp_path, scenario(51, effect), hold if held else None, models)
     assert [a["error_model"] for a in told["adopted"]] == ["temperature_offset"]
     assert told["adopted"][0]["settings"]["lag_s"] == pytest.approx(50.0, abs=10.0)

@@ -25,7 +25,7 @@ def make_late(path: Path) -> None:
 @pytest.mark.parametrize("rms_nT", [0.5, 5.0])
 def test_it_is_found_with_its_delay(rms_nT: float, tmp_path: Path) -> None:
     effect = {"type": "current_field", "channel": "current_heater", "rms_nT": rms_nT}
-    models = ["current_field", "channel_response", "offset_drift", "hysteresis", "passing_source"]
+    models = ["current_field", "channel_response", "offset_drift"]
     told = verdict_of(tmp_path, scenario(31, effect), make_late, models)
     assert [a["error_model"] for a in told["adopted"]] == ["current_field"], suspects(told)
     assert told["adopted"][0]["settings"]["lag_s"] == pytest.approx(-0.5 * LATE, abs=0.15)
