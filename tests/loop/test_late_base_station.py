@@ -24,6 +24,7 @@ def test_the_delay_is_found_and_the_lag_is_the_delay(delay_s: float, seed: int, 
     delay = found["coefficients"][0]
     assert delay["value"] == pytest.approx(delay_s, abs=max(4 * delay["std"], 0.03 * abs(delay_s)))
     assert found["settings"]["lag_s"] == pytest.approx(delay["value"], rel=0.15)
+    assert not told["unexplained"]["present"], told["unexplained"]["description"]  # nor where no reading serves
 
 
 def test_slow_noise_of_the_base_station_is_no_delay(tmp_path: Path) -> None:

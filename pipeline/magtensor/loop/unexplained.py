@@ -29,6 +29,7 @@ from magtensor.loop.statistics import Gain, held_out_gain
 from magtensor.loop.terms import Terms, joined
 
 LONGEST_SPIKE = 2  # samples: what lasts longer is no accident of the recording
+UNCOVERED = 2.0  # steps between samples
 ALPHA = 0.001  # of each of the tests
 NOISE = "what is left is noise: white, and slow noise of each sensor alone or of the reference"
 LEAST_T = 4.5  # one in a thousand by chance: paired t over folds of what the direction predicts
@@ -43,7 +44,7 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
     line = strongest_line(state, record)
     last = found.steps[-1].candidates if found.steps else ()
     seen = [c for c in last if c.passes or (c.adjusted_p < c.alpha and c.adjusted_null_p < ALPHA)]
-    flagged = lasting(~state.fit.keep)
+    flagged = lasting(~state.fit.keep, beyond_the_reference(state, record))
     if flagged.any():  # while effects were sought, what lasts was believed
         seen = [c for c in seen if _still_significant(c, state)]
     suspects = [c for c in seen if not c.of_the_log]
@@ -115,12 +116,27 @@ def excess_rms(state: State) -> float:
     return float(np.sqrt(max(state.residual.square() - 1.0, 0.0)) * state.residual.scale)
 
 
-def lasting(bad: Mask) -> Mask:
-    """(N,) samples in runs of bad ones that are longer than a spike and its neighbour."""
+def lasting(bad: Mask, excused: Mask | None = None) -> Mask:
+    """(N,) samples in runs of bad ones that are longer than a spike and its neighbour and hold none that is excused."""
     out = np.zeros(len(bad), dtype=bool)
     edges = np.flatnonzero(np.diff(np.concatenate(([0], bad.astype(int), [0]))))
     for start, stop in zip(edges[0::2], edges[1::2], strict=True):
-        out[start:stop] = stop - start > LONGEST_SPIKE
+        out[start:stop] = stop - start > LONGEST_SPIKE and (excused is None or not excused[start:stop].any())
+    return out
+
+
+def beyond_the_reference(state: State, record: Record) -> Mask:
+    """(N,) samples for which a base station whose stamps are late or early has no reading within the survey."""
+    out = np.zeros(len(record.time), dtype=bool)
+    if len(record.time) < 2:
+        return out
+    step = float(np.median(np.diff(record.time)))
+    for model in state.adopted:
+        if model.component.effect == "reference" and (lag := float(model.settings.get("lag_s", 0.0))):
+            at = record.time + lag
+            after = np.clip(np.searchsorted(record.time, at), 1, len(record.time) - 1)
+            nearest = np.minimum(np.abs(at - record.time[after - 1]), np.abs(at - record.time[after]))
+            out |= nearest > UNCOVERED * step
     return out
 
 
