@@ -35,21 +35,26 @@ def one() -> Candidate:
 
 
 @pytest.mark.parametrize(
-    ("p", "adjusted_p", "null_p", "gain", "significant"),
+    ("p", "adjusted_p", "null_p", "gain", "tried", "significant"),
     [
-        (1e-9, 0.9 * ALPHA, 1.0, -1.0, True),  # the blocks alone
-        (0.9 * ALONE, 0.3, 0.9 * UNLIKELY * ALPHA, 1.0, True),
-        (1.1 * ALONE, 0.3, 0.9 * UNLIKELY * ALPHA, 1.0, False),  # the blocks do not bear it out
-        (0.9 * ALONE, 0.3, 1.1 * UNLIKELY * ALPHA, 1.0, False),  # not unlikely enough in that noise
-        (0.9 * ALONE, 0.3, 0.9 * UNLIKELY * ALPHA, -1.0, False),  # it predicts nothing in that noise
+        (1e-9, 0.9 * ALPHA, 1.0, -1.0, 1.0, True),  # the blocks alone
+        (0.9 * ALONE, 0.3, 0.9 * UNLIKELY * ALPHA, 1.0, 1.0, True),
+        (1.1 * ALONE, 0.3, 0.9 * UNLIKELY * ALPHA, 1.0, 1.0, False),  # the blocks do not bear it out
+        (0.9 * ALONE, 0.3, 1.1 * UNLIKELY * ALPHA, 1.0, 1.0, False),  # not unlikely enough in that noise
+        (0.9 * ALONE, 0.3, 0.9 * UNLIKELY * ALPHA, -1.0, 1.0, False),  # it predicts nothing in that noise
+        (0.9 * ALONE, 0.3, 0.9 * UNLIKELY * ALPHA, 1.0, 60.0, False),  # one of sixty settings may do as well
     ],
 )
 def test_two_ways_to_pass(
-    one: Candidate, p: float, adjusted_p: float, null_p: float, gain: float, significant: bool
+    one: Candidate, p: float, adjusted_p: float, null_p: float, gain: float, tried: float, significant: bool
 ) -> None:
     null_gain = Gain(np.array([1.0 + gain, 1.0]), np.ones(2), np.full(2, 10.0))
     changed = replace(
-        one, adjusted_p=adjusted_p, adjusted_null_p=null_p, assessment=replace(one.assessment, p=p, null_gain=null_gain)
+        one,
+        tried=tried,
+        adjusted_p=adjusted_p,
+        adjusted_null_p=null_p,
+        assessment=replace(one.assessment, p=p, null_gain=null_gain),
     )
     assert changed.significant is significant
     assert ("own colour" in why(changed, None)) is (significant and adjusted_p > ALPHA)

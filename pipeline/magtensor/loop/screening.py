@@ -32,6 +32,7 @@ from magtensor.loop.terms import Terms, joined
 
 ALPHA = 0.005  # family-wise probability that a clean survey gets an adoption, before the second gate
 ALONE = 1e-3  # probability that a single test by blocks is passed, which bears noise's own colour out
+AMONG_ITS_SETTINGS = 0.05  # the same, that the test with the best of a model's settings is
 UNLIKELY = 0.02  # of the family-wise probability: asked for in noise of the residual's own colour
 LEAST_REDUCTION = 1e-4  # of the held-out sum of squares: smaller is significant only in very long surveys
 LOG_MARGIN = 1.5  # the noise of a log is known to some per cent, and a dozen coefficients gain a little by chance
@@ -80,12 +81,12 @@ class Candidate:
 
         By the scatter over blocks alone; or, because a dozen long blocks tell little of what is very unlikely, in noise
         of the colour that the residual has without the model, in which it then predicts held-out blocks as well, if the
-        blocks bear it out as a single test.
+        blocks bear it out as a test of this model alone.
         """
         if self.adjusted_p < self.alpha:
             return True
         unlikely = self.adjusted_null_p < UNLIKELY * self.alpha and self.assessment.null_gain.total > 0
-        return unlikely and self.assessment.p < ALONE
+        return unlikely and self.assessment.p < ALONE and self.assessment.p * self.tried < AMONG_ITS_SETTINGS
 
     @property
     def beyond_slow_noise(self) -> bool:
