@@ -90,8 +90,10 @@ def apply(
         result.write_calibration(save_calibration, stored, applied)
     words = str(found["calibrated/b"].attrs["rotation_refined"]) if refine_rotation else ""
     told = _told(found["calibrated/b"].attrs) if "calibrated/b" in found else ""
-    left = str(found["calibrated/b"].attrs.get("not_taken_off", "")) if "calibrated/b" in found else ""
-    notes = (*summary(found.flags), *([f"NOT taken off: {left}"] if left else []))
+    attributes = found["calibrated/b"].attrs if "calibrated/b" in found else {}
+    each = {"NOT taken off": "not_taken_off", "extrapolated": "extrapolated"}
+    told_of = (f"{what}: {attributes[name]}" for what, name in each.items() if name in attributes)
+    notes = (*summary(found.flags), *told_of)
     return Applied(target, fit_in_words(survey_block(found)) + told, words, notes)
 
 
@@ -165,7 +167,7 @@ def apply_and_refine(
     from magtensor.calibration.surveys.corrections import with_scatter
     from magtensor.dated import at_date_of
     from magtensor.effect_errors import taken_off
-    from magtensor.loop.stored import cleaned, left_in, on_its_clock, stored_effects
+    from magtensor.loop.stored import cleaned, extrapolated, left_in, on_its_clock, stored_effects
     from magtensor.offsets_apart import scatter_for, without_scatter
     from magtensor.platform_frame import as_fitted, with_refined_rotation
     from magtensor.standing_out import flagged
@@ -188,7 +190,11 @@ def apply_and_refine(
         if judge:
             known = calibration.values("calibration/noise_std") if "calibration/noise_std" in calibration else None
             survey = flagged(survey, fitted, known, uniform=uniform)
-        survey = survey.merged(_named(corrected(fitted, survey, left_in(survey, adopted)), calibration, dated, apart))
+        words = {
+            "not_taken_off": left_in(survey, adopted),
+            "extrapolated": extrapolated(before, calibration, adopted, means),
+        }
+        survey = survey.merged(_named(corrected(fitted, survey, **words), calibration, dated, apart))
         if refine_rotation:
             survey, turned = with_refined_rotation(survey, calibration, fitted)
             if turned is not None:  # as it is kept, it holds the scatter beside the covariance

@@ -90,17 +90,16 @@ def restored(survey: Survey) -> ArrayCalibration:
     )
 
 
-def corrected(calibration: ArrayCalibration, survey: Survey, not_taken_off: str = "") -> dict[str, Variable]:
+def corrected(calibration: ArrayCalibration, survey: Survey, **words: str) -> dict[str, Variable]:
     """`calibrated/b` of every sample and, where the total field is known, `residual/total_field`, after and before.
 
-    `not_taken_off` names effects of the calibration that are still in it.
+    `words` become attributes where they say something: `not_taken_off` names effects that are still in it,
+    `extrapolated` those taken off beyond what the calibration has seen.
     """
     raw = np.asarray(survey.values("b_raw"), dtype=float)
     b = calibration.apply(raw)
     attributes = {"units": "nT", "frame": calibration.frame, "long_name": "calibrated field"}
-    given: dict[str, Variable] = {
-        "calibrated/b": (B, b, attributes | ({"not_taken_off": not_taken_off} if not_taken_off else {}))
-    }
+    given: dict[str, Variable] = {"calibrated/b": (B, b, attributes | {k: v for k, v in words.items() if v})}
     if "total_field" in survey:
         reference = survey.values("total_field")[:, None]
         for name, field in (("total_field", b), ("total_field_before", raw)):

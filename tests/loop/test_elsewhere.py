@@ -77,6 +77,24 @@ def test_a_missing_channel_is_told_with_survey_and_effect(
 SPIKED = [40, 41, 200, 203, 205, 700, 1100]  # a pair, three near each other, three alone
 
 
+def test_an_effect_beyond_what_the_calibration_has_seen_is_told(
+    tmp_path: Path, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def stronger(file: h5py.File) -> None:
+        file["current_heater"][...] = 3.0 * file["current_heater"][()]
+
+    magtensor.close_loop(folder / "heated.h5", search=["current_field"]).calibration.save(tmp_path / "c.nc")
+    for name, said in (("hot.h5", ""), (changed(folder, "hot.h5", stronger).name, "extrapolated: current_field: ")):
+        arguments = ["apply", str(tmp_path / "c.nc"), str(folder / name), "--output", str(tmp_path / "a.nc")]
+        assert status_of(arguments) == 0
+        out = capsys.readouterr().out
+        assert ("extrapolated" in out) is bool(said) and said in out
+        with h5py.File(tmp_path / "a.nc") as file:
+            assert ("extrapolated" in file["calibrated/b"].attrs) is bool(said)
+    beyond = re.search(r"current_heater goes ([\d.]+) A beyond what the calibration has seen", out)
+    assert beyond is not None and float(beyond[1]) > 2.0
+
+
 def test_spikes_of_another_survey_are_flagged(tmp_path: Path, folder: Path, plain: ClosedLoop) -> None:
     calibrated = plain.calibration.apply(changed(folder, "other.h5", spikes(SPIKED)))
     assert np.flatnonzero(~calibrated["calibrated/good"].values).tolist() == SPIKED

@@ -23,6 +23,8 @@ from magtensor.registry import Registry
 from magtensor.survey.model import Survey, Variable
 from magtensor.survey.times import split_since
 
+MOST_BEYOND = 0.25  # of the range that a calibration has seen of a channel
+
 
 def effect_variables(
     adopted: Sequence[Adopted], theta: Sequence[Array], means: Mapping[str, Array], survey: Survey
@@ -45,6 +47,7 @@ def effect_variables(
     ]
     attributes = {"channel_means": json.dumps({k: np.asarray(v).tolist() for k, v in means.items()})}
     attributes["start"] = started(survey).isoformat()
+    attributes["channel_ranges"] = json.dumps(_ranges(record_of(survey, means)))
     return {"calibration/effects": (("effect",), np.array(texts, dtype=np.str_), attributes)}
 
 
@@ -152,6 +155,37 @@ def _lacking(effect: Adopted, record: Record) -> str:
         if options and not any(known.get(o, o in FACTS) or x.channels_like(o) for o in options):
             return " or ".join(options)
     return ""
+
+
+def _ranges(record: Record) -> dict[str, list[float]]:
+    """Least and largest value of each channel, the calibration's mean taken off; those of several columns together."""
+    return {name: [float(v.min()), float(v.max())] for name, v in record.logged.items()}
+
+
+def extrapolated(survey: Survey, calibration: Survey, adopted: Sequence[Adopted], means: Mapping[str, Array]) -> str:
+    """Which effects follow a channel beyond what the calibration has seen of it, and how far; "" where none does."""
+    known = calibration["calibration/effects"].attrs.get("channel_ranges") if adopted else None
+    if known is None:
+        return ""
+    seen, record = json.loads(str(known)), record_of(survey, means)
+    now, words = _ranges(record), []
+    for effect in adopted:
+        for channel in _followed(effect, record):
+            if channel not in seen or channel not in now:
+                continue
+            low, high = seen[channel]
+            beyond = max(low - now[channel][0], now[channel][1] - high)
+            if beyond > MOST_BEYOND * (high - low):
+                units = f" {record.units[channel]}" if record.units[channel] else ""
+                words.append(f"{effect.name}: {channel} goes {beyond:.3g}{units} beyond what the calibration has seen")
+    return "; ".join(dict.fromkeys(words))
+
+
+def _followed(effect: Adopted, record: Record) -> list[str]:
+    """The channels that an effect follows."""
+    x = record.excitation(record.raw, record.raw)
+    marks = {n: m for n, m in profiled(effect.component).items() if isinstance(m, AnyChannel)}
+    return [str(effect.settings.get(n, "")) or (mark.values(x) or [""])[0] for n, mark in marks.items()]
 
 
 def left_in(survey: Survey, adopted: Sequence[Adopted]) -> str:
