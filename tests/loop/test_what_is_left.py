@@ -10,8 +10,9 @@ import pytest
 from loop_cases import Array, linear_state, synthetic
 
 from magtensor.loop.model import Fitting
+from magtensor.loop.predictable import predictable_in_the_total_field
 from magtensor.loop.search import search
-from magtensor.loop.unexplained import NOISE, predictable_in_the_total_field, unexplained
+from magtensor.loop.unexplained import NOISE, unexplained
 
 
 def cubed(raw: Array) -> Array:

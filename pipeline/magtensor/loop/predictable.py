@@ -1,0 +1,95 @@
+"""What of a residual can be predicted from the attitude, whatever the law."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from magtensor.loop.assessment import WHITE, Colours, block_count
+from magtensor.loop.direction import attitude_series, direction_series
+from magtensor.loop.excitation import Excitation
+from magtensor.loop.model import State
+from magtensor.loop.statistics import Gain, held_out_gain
+from magtensor.loop.terms import Terms, joined
+
+LEAST_T = 4.5  # one in a thousand by chance: paired t over folds of what the direction predicts
+MOSTLY = 0.9  # of what outputs of their own explain: if the total field alone does that, it is the total field
+LEAST_FOR_DIRECTION = 60  # samples for each output, at least, before its own polynomial can be asked for
+
+
+def attitude_words(state: State) -> list[str]:
+    """What of the residual the attitude predicts: in the outputs, or in the total field alone where that does."""
+    turning, moving = predictable_from_direction(state), predictable_in_the_total_field(state)
+    if moving > 0 and moving > MOSTLY * turning:
+        spread = np.sqrt(state.residual.freedom * np.mean(state.residual.reference_gain**-2.0))  # nT, of |b| - F
+        return [
+            f"{moving * spread:.3g} nT rms of |b| - F, in all sensors alike, can be predicted from the attitude: the "
+            "field may change as the array moves"
+        ]
+    amount = turning * state.residual.scale
+    words = f"{amount:.3g} nT rms of it can be predicted from the direction of the field and how it turns"
+    return [words] if turning > 0 else []
+
+
+def predictable_from_direction(state: State) -> float:
+    """The part of the whitened residual, rms, that follows the field's direction and its rate of change; 0 if none.
+
+    Any smooth effect of attitude, named or not, is a polynomial of the direction to first order: second and third
+    degree and the rate of change, with coefficients of every output's own, are fitted on some blocks and judged on
+    others. Noise makes such a model worse than none.
+    """
+    if len(state.residual.affine) < LEAST_FOR_DIRECTION * 3 * len(state.excitation.sensors):
+        return 0.0
+    return _predictable(state, _direction_terms(state.excitation))
+
+
+def predictable_in_the_total_field(state: State) -> float:
+    """The part of the whitened residual, rms, that the attitude predicts as a change of the total field; 0 if none.
+
+    The same for what no sensor feels alone: polynomials of the direction, and of attitudes and accelerations where they
+    are logged, added to the reference.
+    """
+    series = attitude_series(state.excitation)
+    if state.residual.along is None or len(state.residual.affine) < LEAST_FOR_DIRECTION * series.shape[1]:
+        return 0.0
+    each = [state.excitation.on_reference(column, "nT", str(number)) for number, column in enumerate(series.T)]
+    return _predictable(state, joined(each))
+
+
+def _predictable(state: State, terms: Terms) -> float:
+    """The part of the whitened residual, rms over all its values, that terms at all samples predict on blocks that they
+    were not fitted to; 0 if none."""
+    from magtensor.loop.evidence import grams
+
+    residual = state.residual
+    terms = terms.at(residual.samples)
+    given = 0
+    if state.terms is not None:
+        given = state.terms.count
+        terms = joined([state.terms, terms])
+    blocked = np.arange(terms.count) < given
+
+    def gain_in(colours: Colours) -> Gain:
+        blocks = grams(residual, terms, colours.across, colours.along, block_count(len(residual.affine)))
+        return held_out_gain(blocks, residual.freedom, blocked)
+
+    gain = gain_in(state.colours)
+    if gain.total <= 0 or gain.t < LEAST_T:
+        return 0.0
+    before, after = gain_in(WHITE).rms  # seen through the filter the amount would be too small
+    return float(np.sqrt(max(before**2 - after**2, 0.0)))
+
+
+def _direction_terms(x: Excitation) -> Terms:
+    """Every output's own coefficients of monomials of the field's direction and of its rate of change."""
+    series = direction_series(x)
+    outputs, k = 3 * len(x.sensors), series.shape[1]
+    part_output, part_series = np.repeat(np.arange(outputs), k), np.tile(np.arange(k), outputs)
+    return Terms(
+        tuple(f"direction {s}" for s in part_series),
+        tuple(x.sensors[o // 3] for o in part_output),
+        ("nT",) * (outputs * k),
+        series,
+        np.arange(outputs * k),
+        part_output,
+        part_series,
+    )
