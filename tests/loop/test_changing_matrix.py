@@ -12,6 +12,7 @@ from magtensor.loop.changing_matrix import changing_matrices
 from magtensor.loop.model import Fitting, Record
 from magtensor.loop.search import search
 from magtensor.loop.unexplained import NOISE, unexplained
+from magtensor.registry import Registry
 
 ALPHA = 0.001
 
@@ -148,3 +149,16 @@ def test_the_verdict_says_so() -> None:
     )
     assert not clean["present"] and clean["description"] == NOISE
     assert disturbed["present"] and "C of S3 is not constant" in disturbed["description"]
+
+
+@pytest.mark.parametrize("jumps", [False, True])
+def test_a_mount_that_turns_with_temperature_has_not_jumped(jumps: bool) -> None:
+    rng = np.random.default_rng(16)
+    warm = warmth(rng, 1200)
+    angle = np.where(np.arange(1200) > 700, 2e-5, -2e-5) if jumps else 4e-5 * warm
+    record = with_channels(turned(synthetic(16, turning_s=3.0), 1, angle), temperature=warm)
+    found = search(record, [Registry.load().find("error_model", "turn_step")], Fitting())
+    assert [a.name for a in found.last.adopted] == ["turn_step"] * jumps
+    told = unexplained(found, record)
+    assert ("C of S2 is not constant" in told["description"]) is not jumps
+    assert any("C of S2 follows temperature" in why for s in found.steps for why in s.refused.values()) is not jumps

@@ -75,6 +75,30 @@ def changing_matrices(state: State, alpha: float) -> list[ChangingMatrix]:
     return found
 
 
+def channel_instead(state: State, terms: Terms, colours: Colours) -> str:
+    """The logged channel whose product with the field, in matrices of the same sensors, explains far more than terms
+    (at the residual's samples) do; "" where none does.
+
+    A mount that turns with temperature looks like one that jumped. Blocks that lie between others tell the two apart.
+    """
+    residual, x = state.residual, state.excitation
+    numbers = [i for i, s in enumerate(x.sensors) if s in terms.sensors]
+    channels = {name: w for name, w in waveforms_of(x).items() if name != SLOW}
+    if len(residual.affine) < LEAST_SAMPLES or not numbers or not channels:
+        return ""
+    white = Whitened.of(residual, colours.across, colours.along, state.terms)
+
+    def gain(more: Terms) -> float:
+        blocks = grams_in(white, more, BLOCKS)
+        given = np.arange(blocks.count) < blocks.count - more.count
+        return interleaved_gain(blocks, residual.freedom, given, np.ones(blocks.count, dtype=bool)).total
+
+    products = {n: joined([_products(x, i, w) for i in numbers]).at(residual.samples) for n, w in channels.items()}
+    gains = {name: gain(more) - more.count for name, more in products.items()}
+    best = max(gains, key=lambda name: gains[name])
+    return best if gains[best] > gain(terms) + SEPARATION else ""
+
+
 def waveforms_of(x: Excitation) -> dict[str, Array]:
     """Name -> (N, 1, K) cosines over the survey; (N, 1, 1) or, one for each sensor, (N, S, 1) a logged channel.
 

@@ -13,13 +13,15 @@ from dataclasses import dataclass, field, replace
 from magtensor.components import Component
 from magtensor.errors import DataError
 from magtensor.loop.adopting import adopt, narrowed, polished
+from magtensor.loop.changing_matrix import channel_instead
 from magtensor.loop.contribution import eliminate
 from magtensor.loop.excitation import Excitation
 from magtensor.loop.latent import NAME, Sought, renewed, sought, tried_source
 from magtensor.loop.model import Adopted, Fitting, Record, State, joint_state
 from magtensor.loop.needs import missing
-from magtensor.loop.screening import ALPHA, Candidate, candidates_of, generic, repeatable
+from magtensor.loop.screening import ALPHA, Candidate, candidates_of, generic, profiled, repeatable
 from magtensor.loop.separation import SEPARATION, fold_gain, separated
+from magtensor.loop.settings import EventTimes
 from magtensor.loop.spectrum import spectral_lines
 from magtensor.loop.trial import Trial, trial
 
@@ -197,6 +199,14 @@ def _kept(record: Record, before: Trial, chosen: Candidate, how: Fitting) -> tup
         return None, "fitted, its coefficients are not what its settings assume"
     if not before.likelier(after):
         return None, "fitted together with the others, it leaves more than it takes away"
+    if any(isinstance(grid, EventTimes) for grid in profiled(model.component).values()):
+        own = model.sensors or tuple(record.sensors)
+        terms = chosen.terms.only(i for i, s in enumerate(chosen.terms.sensors) if s in own)
+        if channel := channel_instead(before.state, terms, chosen.assessment.colours):
+            return (
+                None,
+                f"C of {', '.join(own)} follows {channel}, which explains more than something that happens once",
+            )
     return after, ""
 
 
