@@ -72,18 +72,17 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
 
 
 def noise_words(state: State) -> str:
-    """What is left where nothing is unexplained, and how much of it is no white noise where that is the larger part."""
-    across, along = state.residual.across, state.residual.along
-    words = [NOISE]
-    if across is not None:
-        beyond = float(np.sum(across**2)) / (len(across) * (state.residual.freedom - (along is not None))) - 1.0
-        if beyond > 1.0:
-            words.append(
-                f"{np.sqrt(beyond) * state.residual.scale:.3g} nT rms is not white, mostly on {_sensors(state)}"
-            )
-    if along is not None and np.mean(along**2) > 2.0:
-        rms = np.sqrt(np.mean((along**2 - 1.0) / state.residual.reference_gain**2))
-        words.append(f"{rms:.3g} nT rms of |b| - F is not white")
+    """What is left where nothing is unexplained, and what of it is not white where that is more than what is."""
+    residual, white, words = state.residual, state.residual.scale, [NOISE]
+    if residual.across is not None:
+        values = len(residual.across) * (residual.freedom - (residual.along is not None))
+        slow = white * max(float(np.sum(residual.across**2)) / values - 1.0, 0.0) ** 0.5
+        if slow > white:
+            words.append(f"{slow:.3g} nT rms is not white, mostly on {_sensors(state)}")
+    if residual.along is not None:
+        slow = max(float(np.mean((residual.along**2 - 1.0) / residual.reference_gain**2)), 0.0) ** 0.5
+        if slow > white:
+            words.append(f"{slow:.3g} nT rms of |b| - F is not white")
     return "; ".join(words)
 
 
