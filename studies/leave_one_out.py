@@ -37,7 +37,7 @@ from magtensor.errors import MagtensorError
 from magtensor.loop.contribution import removal
 from magtensor.loop.errors_before_after import held_out_error
 from magtensor.loop.model import Fitting
-from magtensor.loop.overshadowed import traced
+from magtensor.loop.search import search
 from magtensor.loop.unexplained import unexplained
 
 FIRST_SEED = 5000
@@ -55,7 +55,7 @@ def tried(trial: Trial) -> dict[str, Any]:
     how = Fitting()
     try:
         record = recorded(simulated(trial))
-        found = traced(record, [m for name, m in models().items() if name != trial.effect], how)
+        found = search(record, [m for name, m in models().items() if name != trial.effect], how)
     except MagtensorError as error:
         return row | {"outcome": "cannot be", "description": str(error).splitlines()[0]}
     last = found.last

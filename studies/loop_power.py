@@ -46,11 +46,11 @@ from magtensor.components import Component
 from magtensor.errors import MagtensorError
 from magtensor.loop.assessment import Colours, colours_of, estimated, explained
 from magtensor.loop.colour import Colour
+from magtensor.loop.found import Search
 from magtensor.loop.model import Fitting, Record, State, joint_state
 from magtensor.loop.outcome import why
-from magtensor.loop.overshadowed import traced
 from magtensor.loop.residual import Residual
-from magtensor.loop.search import Search
+from magtensor.loop.search import search
 from magtensor.loop.turned import TurnedColour
 from magtensor.loop.unexplained import unexplained
 from magtensor.registry import Registry
@@ -190,7 +190,7 @@ def tried(trial: Trial) -> dict[str, Any]:
         record = recorded(simulation)
         state = joint_state(record, [], Fitting())
         row["oracle"] = oracle(trial, simulation, record, state)
-        found = traced(record, list(models().values()), Fitting())
+        found = search(record, list(models().values()), Fitting())
     except MagtensorError as error:
         return row | {"outcome": "cannot be", "why": str(error).splitlines()[0]}
     left = unexplained(found, record)

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from loop_cases import BASE, loaded, scenario
 
+from magtensor.loop.found import Search
 from magtensor.loop.long_record import on_every_sample, part_of
 from magtensor.loop.model import Fitting, joint_state
-from magtensor.loop.search import Search, search
+from magtensor.loop.search import search
 from magtensor.loop.unexplained import unexplained
 from magtensor.registry import Registry
 

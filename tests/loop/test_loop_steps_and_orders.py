@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 from loop_cases import linear_state, loaded, scenario, synthetic
 
+from magtensor.loop.found import Search
 from magtensor.loop.model import Fitting
-from magtensor.loop.search import Search, search
+from magtensor.loop.search import search
 from magtensor.registry import Registry
 
 SAMPLES = 300

@@ -12,11 +12,12 @@ from magtensor.errors import DataError, NotEnoughData, UsageError, did_you_mean
 from magtensor.loop.adopting import adopt
 from magtensor.loop.assessment import estimated
 from magtensor.loop.contribution import removal
+from magtensor.loop.found import Step
 from magtensor.loop.latent import NAME, renewed, sought, tried_source
 from magtensor.loop.model import Fitting, Record, State, joint_state
 from magtensor.loop.outcome import why
 from magtensor.loop.screening import Candidate, candidates_of, profiled
-from magtensor.loop.search import Step, simplest
+from magtensor.loop.search import simplest
 from magtensor.loop.settings import AnyChannel
 from magtensor.loop.trial import trial
 

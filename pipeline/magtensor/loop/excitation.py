@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from magtensor.calibration.types import Array
 from magtensor.errors import did_you_mean
-from magtensor.loop.held import unheld
+from magtensor.loop.held_logs import unheld
 from magtensor.loop.terms import REFERENCE, Terms
 
 AXES = "xyz"

@@ -50,7 +50,7 @@ def flagged_words(flagged: Mask, state: State, record: Record) -> str:
         own = np.mean(every.across[flagged].reshape(int(flagged.sum()), -1, 3) ** 2, axis=(0, 2))
     if every.along is not None and shared > own.max():
         amount = float(np.sqrt(np.mean((every.along[flagged] / every.reference_gain[flagged]) ** 2)))
-        where = " of |b| - F, in all sensors alike"
+        where = " of |b| - F" + ("" if every.across is None else ", in all sensors alike")
     else:
         worst = int(np.argmax(own))
         amount = float(np.sqrt(own[worst] * np.mean(every.noise[3 * worst : 3 * worst + 3] ** 2)))

@@ -16,15 +16,15 @@ from magtensor.errors import DataError, NotEnoughData, UsageError, did_you_mean
 from magtensor.loop import by_hand
 from magtensor.loop.by_hand import ByHand
 from magtensor.loop.decisions import Decision
+from magtensor.loop.found import Search, Step
 from magtensor.loop.latent import NAME, sought
 from magtensor.loop.long_record import on_every_sample, part_of
 from magtensor.loop.model import Adopted, Fitting, Record, State, joint_state, without
 from magtensor.loop.needs import missing
 from magtensor.loop.outcome import described
-from magtensor.loop.overshadowed import traced
 from magtensor.loop.record import record_of
 from magtensor.loop.screening import Candidate, candidates_of, repeatable
-from magtensor.loop.search import Search, Step, with_lines
+from magtensor.loop.search import search, with_lines
 from magtensor.survey.model import Survey
 
 PERSON, LOOP, DECLARED = "person", "loop", "declared"
@@ -212,7 +212,7 @@ class Inquiry:
         begin = self.declared if before is None else list(before.state.adopted)
         closed = {*leaving, *((before.rejected or {}) if before else ())}
         models = [m for m in self.models if m.name not in closed]
-        found = traced(
+        found = search(
             record, models, self.how, declared=begin, most_effects=self.most_effects, alpha=self.alpha,
             lines=self._part.lines,
         )  # fmt: skip

@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from magtensor.calibration.joint import JointFit
+from magtensor.loop.found import Search
 from magtensor.loop.latent import renewed
 from magtensor.loop.model import Adopted, Fitting, Record, joint_state
-from magtensor.loop.search import Search
 from magtensor.loop.spectrum import spectral_lines
 
 MOST_SEARCHED = 40_000  # samples

@@ -9,9 +9,9 @@ from magtensor.calibration.nominal import Nominal
 from magtensor.calibration.types import ArrayCalibration
 from magtensor.calibration.undetermined import Undetermined, undetermined
 from magtensor.errors import DataError
+from magtensor.loop.found import Search
 from magtensor.loop.inquiry import Inquiry
 from magtensor.loop.model import Fitting, require_determined
-from magtensor.loop.search import Search
 
 Inquire = Callable[[Fitting], Inquiry]
 

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 
 from magtensor.loop.contribution import removal
+from magtensor.loop.found import Search, Step
 from magtensor.loop.model import Adopted, Record
 from magtensor.loop.screening import Candidate, profiled
-from magtensor.loop.search import Search, Step
 from magtensor.loop.settings import Range
 from magtensor.loop.waveform import NAME
 

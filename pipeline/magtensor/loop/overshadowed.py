@@ -1,4 +1,4 @@
-"""The search, and what it adopted weighed against what it left.
+"""What a search adopted, weighed against what it left.
 
 Any law of the attitude resembles any other one a little. Where something large that follows the attitude has no name
 (a gradient of the site, and no attitude logged to know it by), a named law that is a small part of it is significant,
@@ -9,46 +9,20 @@ taken out again.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import replace
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 
-from magtensor.components import Component
 from magtensor.loop.contribution import removal, slices
 from magtensor.loop.direction import attitude_series
-from magtensor.loop.latent import NAME, renewed, sought
-from magtensor.loop.model import Adopted, Fitting, Record, State, joint_state
-from magtensor.loop.screening import ALPHA, candidates_of
-from magtensor.loop.search import MOST_EFFECTS, Search, Step, open_models, search, with_lines
+from magtensor.loop.found import Search
+from magtensor.loop.model import State
 from magtensor.loop.unexplained import excess_rms, unexplained
 
 MOSTLY = 0.5  # of what an effect adds: so much of it, predicted from the attitude, follows the attitude
 
 
-def traced(
-    record: Record,
-    models: Sequence[Component],
-    how: Fitting,
-    *,
-    declared: Sequence[Adopted] = (),
-    most_effects: int = MOST_EFFECTS,
-    alpha: float = ALPHA,
-    lines: Sequence[float] | None = None,
-    say: Callable[[str], None] | None = None,
-) -> Search:
-    """As `search`, without the effects that what stays unexplained overshadows; the weakest goes first."""
-    found = search(record, models, how, declared=declared, most_effects=most_effects, alpha=alpha, lines=lines, say=say)
-    while doubted := _overshadowed(found, len(declared)):
-        name, why = doubted
-        if say is not None:
-            say(f"taking {name} out again")
-        found = _without(found, name, why, models, how, len(declared), alpha, lines)
-    return found
-
-
-def _overshadowed(found: Search, fixed: int) -> tuple[str, str] | None:
+def overshadowed(found: Search, fixed: int) -> tuple[str, str] | None:
     """The weakest effect that follows the attitude and explains less than what stays, and why it is doubted."""
     state, left = found.last, excess_rms(found.last)
     weakest: tuple[float, str] | None = None
@@ -79,29 +53,3 @@ def attitude_share(state: State, places: Sequence[int]) -> float:
     follows = np.linalg.lstsq(series, added, rcond=None)[0]
     total = float(np.sum(added**2))
     return 1.0 - float(np.sum((added - series @ follows) ** 2)) / total if total > 0 else 0.0
-
-
-def _without(
-    found: Search,
-    name: str,
-    why: str,
-    models: Sequence[Component],
-    how: Fitting,
-    fixed: int,
-    alpha: float,
-    lines: Sequence[float] | None,
-) -> Search:
-    """The search without one of the effects it adopted, and with a last look at what is left."""
-    before = found.last
-    kept = [i for i, a in enumerate(before.adopted) if i < fixed or a.name != name]
-    adopted, theta = [before.adopted[i] for i in kept], [before.theta[i] for i in kept]
-    record, state = renewed(found.record, joint_state(found.record, adopted, how, theta, before.lines), how)
-    state = with_lines(state, record, lines)
-    testable = [m for m in models if m.name not in found.not_tested and m.name != NAME]
-    failed: dict[str, Any] = dict(found.failed)
-    candidates = candidates_of(state, open_models(testable, state), failed, alpha)
-    last = joint_state(record, state.adopted, replace(how, searching=False), state.theta, state.lines)
-    step = Step(state, tuple(candidates), None, refused={name: why})
-    return replace(
-        found, last=last, steps=(*found.steps, step), failed=failed, record=record, shared=sought(last, record)
-    )

@@ -1,8 +1,9 @@
 """The search: screen every error model, adopt what the data want on blocks the fit has not seen, refit, repeat.
 
-An effect is adopted only when it passes two independent gates: a jackknife over blocks that autocorrelation cannot
-fool, with the family-wise error held by Holm's rule over every model and every setting tried, and a gain on held-out
-contiguous folds. Rivals that do as well on this survey are named, and the simplest of them is adopted.
+An effect is adopted only when it passes two independent gates: significance that autocorrelation cannot fake, with the
+family-wise error held by Holm's rule over every model and every setting tried, and a gain on held-out contiguous folds.
+Rivals that do as well on this survey are named, and the simplest of them is adopted. In the end what was adopted is
+weighed against what stays unexplained.
 """
 
 from __future__ import annotations
@@ -16,9 +17,11 @@ from magtensor.loop.adopting import adopt, narrowed, polished
 from magtensor.loop.changing_matrix import channel_instead
 from magtensor.loop.contribution import eliminate
 from magtensor.loop.excitation import Excitation
+from magtensor.loop.found import Search, Step
 from magtensor.loop.latent import NAME, Sought, renewed, sought, tried_source
 from magtensor.loop.model import Adopted, Fitting, Record, State, joint_state
 from magtensor.loop.needs import missing
+from magtensor.loop.overshadowed import overshadowed
 from magtensor.loop.screening import ALPHA, Candidate, candidates_of, generic, profiled, repeatable
 from magtensor.loop.separation import SEPARATION, fold_gain, separated
 from magtensor.loop.settings import EventTimes
@@ -27,48 +30,6 @@ from magtensor.loop.trial import Trial, trial
 
 MOST_EFFECTS = 8
 ROUNDING = 1e-4  # mean square of the whitened residual: far below the least noise that any sensor is believed to have
-
-
-@dataclass(frozen=True)
-class Step:
-    """One round of the search: what was looked at and what was done.
-
-    Attributes:
-        before: state before; candidates: by held-out gain, best first.
-        adopted: the candidate adopted, None where none was.
-        rivals: names of models that the data do not separate from it.
-        dropped: models dropped after the refit.
-        refused: model -> why it was not kept after it had been fitted.
-    """
-
-    before: State
-    candidates: tuple[Candidate, ...]
-    adopted: Candidate | None
-    rivals: tuple[str, ...] = ()
-    dropped: tuple[str, ...] = ()
-    refused: Mapping[str, str] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class Search:
-    """The whole search.
-
-    Attributes:
-        first, last: states with the declared model and with all that was adopted.
-        steps: in order.
-        not_tested: model -> what the survey lacks for it.
-        failed: model -> why its regressors could not be made.
-        record: the samples, with the waveform of a source that nobody logged where one was adopted.
-        shared: the waveform that the sensors share after all that was adopted; None where it cannot be asked for.
-    """
-
-    first: State
-    last: State
-    steps: tuple[Step, ...]
-    not_tested: Mapping[str, tuple[str, ...]]
-    failed: Mapping[str, str]
-    record: Record
-    shared: Sought | None
 
 
 def search(
@@ -127,9 +88,31 @@ def search(
         steps[-1] = replace(steps[-1], adopted=source.evidence)
         record, state, shared = source.record, source.after, None
         standing = trial(record, state, how)
-    # what nothing explains is a disturbance after all, and no part of the calibration
-    last = joint_state(record, state.adopted, replace(how, searching=False), state.theta, state.lines)
-    return Search(first, last, tuple(steps), not_tested, failed, record, shared or sought(last, record))
+    found = Search(first, _settled(record, state, how), tuple(steps), not_tested, failed, record, shared)
+    found = replace(found, shared=shared or sought(found.last, record))
+    while doubted := overshadowed(found, len(declared)):
+        name, why = doubted
+        if say is not None:
+            say(f"taking {name} out again")
+        record, state = renewed(record, _without(found, name, len(declared), how), how)
+        state = with_lines(state, record, lines)
+        candidates = candidates_of(state, open_models(testable, state), failed, alpha)
+        steps.append(Step(state, tuple(candidates), None, refused={name: why}))
+        last = _settled(record, state, how)
+        found = replace(found, last=last, steps=tuple(steps), record=record, shared=sought(last, record))
+    return found
+
+
+def _settled(record: Record, state: State, how: Fitting) -> State:
+    """The fit at the end: what nothing explains is a disturbance after all, and no part of the calibration."""
+    return joint_state(record, state.adopted, replace(how, searching=False), state.theta, state.lines)
+
+
+def _without(found: Search, name: str, fixed: int, how: Fitting) -> State:
+    """The fit without the models of a name, but for the first ones."""
+    last = found.last
+    kept = [i for i, a in enumerate(last.adopted) if i < fixed or a.name != name]
+    return joint_state(found.record, [last.adopted[i] for i in kept], how, [last.theta[i] for i in kept], last.lines)
 
 
 @dataclass(frozen=True)
@@ -203,10 +186,8 @@ def _kept(record: Record, before: Trial, chosen: Candidate, how: Fitting) -> tup
         own = model.sensors or tuple(record.sensors)
         terms = chosen.terms.only(i for i, s in enumerate(chosen.terms.sensors) if s in own)
         if channel := channel_instead(before.state, terms, chosen.assessment.colours):
-            return (
-                None,
-                f"C of {', '.join(own)} follows {channel}, which explains more than something that happens once",
-            )
+            why = f"C of {', '.join(own)} follows {channel}, which explains more than something that happens once"
+            return None, why
     return after, ""
 
 

@@ -167,7 +167,7 @@ def extrapolated(survey: Survey, calibration: Survey, adopted: Sequence[Adopted]
     known = calibration["calibration/effects"].attrs.get("channel_ranges") if adopted else None
     if known is None:
         return ""
-    seen, record = json.loads(str(known)), record_of(survey, means)
+    seen, record = json.loads(str(known)), record_of(survey, means, use=survey.good)
     now, words = _ranges(record), []
     for effect in adopted:
         for channel in _followed(effect, record):

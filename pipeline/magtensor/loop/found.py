@@ -1,0 +1,52 @@
+"""What a search has found: its rounds, and where it ended."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from magtensor.loop.latent import Sought
+from magtensor.loop.model import Record, State
+from magtensor.loop.screening import Candidate
+
+
+@dataclass(frozen=True)
+class Step:
+    """One round of the search: what was looked at and what was done.
+
+    Attributes:
+        before: state before; candidates: by held-out gain, best first.
+        adopted: the candidate adopted, None where none was.
+        rivals: names of models that the data do not separate from it.
+        dropped: models dropped after the refit.
+        refused: model -> why it was not kept after it had been fitted.
+    """
+
+    before: State
+    candidates: tuple[Candidate, ...]
+    adopted: Candidate | None
+    rivals: tuple[str, ...] = ()
+    dropped: tuple[str, ...] = ()
+    refused: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Search:
+    """The whole search.
+
+    Attributes:
+        first, last: states with the declared model and with all that was adopted.
+        steps: in order.
+        not_tested: model -> what the survey lacks for it.
+        failed: model -> why its regressors could not be made.
+        record: the samples, with the waveform of a source that nobody logged where one was adopted.
+        shared: the waveform that the sensors share after all that was adopted; None where it cannot be asked for.
+    """
+
+    first: State
+    last: State
+    steps: tuple[Step, ...]
+    not_tested: Mapping[str, tuple[str, ...]]
+    failed: Mapping[str, str]
+    record: Record
+    shared: Sought | None
