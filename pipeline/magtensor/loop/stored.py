@@ -165,11 +165,11 @@ def _ranges(record: Record) -> dict[str, list[float]]:
 def extrapolated(survey: Survey, calibration: Survey, adopted: Sequence[Adopted], means: Mapping[str, Array]) -> str:
     """Which effects follow a channel beyond what the calibration has seen of it, and how far; "" where none does."""
     known = calibration["calibration/effects"].attrs.get("channel_ranges") if adopted else None
-    if known is None:
+    if known is None or not survey.good.any():
         return ""
     seen, record = json.loads(str(known)), record_of(survey, means, use=survey.good)
     now, words = _ranges(record), []
-    for effect in adopted:
+    for effect in (a for a in adopted if a.component.effect != "site"):  # what belongs to a site is not taken off
         for channel in _followed(effect, record):
             if channel not in seen or channel not in now:
                 continue
