@@ -16,7 +16,7 @@ platform leans and turns (and wanders by itself), the battery's voltage and a te
 
 Within 2 to 5 deg the attitudes are sometimes just enough for the fit without a prior, which then decides as it does on
 any survey; those flights have rows of their own. Where the reference is a constant, the field's own variation is there
-to be told.
+to be told; where it is called `reference_drift`, which it is, it counts as wrong all the same.
 
 Rows that exist are not made again: the command goes on where it stopped, and writes the page from all of them.
 """
