@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 
 import pytest
+
+os.environ["MAGTENSOR_PROCESSES"] = "1"  # the tests themselves share the cores
 
 
 @pytest.fixture(autouse=True)

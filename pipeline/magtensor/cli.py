@@ -12,6 +12,7 @@ import click
 
 from magtensor import __version__
 from magtensor.errors import MagtensorError
+from magtensor.sharing import PROCESSES, cores
 
 FILE = click.Path(path_type=Path, dir_okay=False)
 FOLDER = click.Path(path_type=Path, file_okay=False)
@@ -291,6 +292,7 @@ def status_of(arguments: list[str] | None = None) -> int:
     # order give the same bits again
     for variable in ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS"):
         os.environ.setdefault(variable, "1")
+    os.environ.setdefault(PROCESSES, str(cores()))
     try:
         outcome = cli.main(args=arguments, prog_name="magtensor", standalone_mode=False)
     except click.ClickException as error:

@@ -21,6 +21,7 @@ from magtensor.closed_loop import RECIPE as PACKAGED
 from magtensor.closed_loop import ClosedLoop
 from magtensor.result import FILES, open_result
 from magtensor.session import run_recipe
+from magtensor.sharing import PROCESSES
 from magtensor.survey.canonical import read_canonical
 from magtensor.survey.in_memory import Held, given_survey
 from magtensor.survey.model import Survey
@@ -44,6 +45,13 @@ def found(surveys: tuple[Path, Path]) -> ClosedLoop:
 
 def content(of: ClosedLoop) -> str:
     return provenance.content_sha256(of.dataset)
+
+
+def test_two_processes_find_the_same_bits_as_one(
+    found: ClosedLoop, surveys: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(PROCESSES, "2")
+    assert content(magtensor.close_loop(surveys[0], search=SEARCH)) == content(found)
 
 
 def test_the_packaged_recipe_is_the_one_of_the_contract() -> None:

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from magtensor.recipe.source import Document
+from magtensor.sharing import PROCESSES
 
 ERROR_FILE = "error.txt"
 GRACE_S = 5.0  # between asking a process to end and ending it
@@ -97,7 +98,7 @@ class Processes:
                 self._running.discard(process)
 
     def _start(self, stderr: int) -> subprocess.Popen[bytes]:
-        environment = {**dict.fromkeys(THREADS, "1"), **os.environ}
+        environment = {**dict.fromkeys(THREADS, "1"), **os.environ, PROCESSES: "1"}
         return subprocess.Popen(
             [sys.executable, "-P", "-X", "faulthandler", "-m", "magtensor.batch.worker"],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=stderr, env=environment,

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Generator, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from typing import Any, Protocol
 
 from magtensor.batch.process import Outcome, Processes, Task, run_isolated
 from magtensor.errors import UsageError
+from magtensor.sharing import cores
 
 CONNECT_S = 10
 
@@ -28,8 +28,7 @@ class LocalRunner:
     """At most `workers` processes of this machine at once; default: one per core this process may use."""
 
     def __init__(self, workers: int | None = None) -> None:
-        allowed = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-        self.workers = workers or allowed or 1
+        self.workers = workers or cores()
 
     def run(self, tasks: Iterable[Task]) -> Generator[tuple[Task, Outcome]]:
         """As `Runner.run`."""

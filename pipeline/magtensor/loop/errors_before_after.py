@@ -13,6 +13,7 @@ from magtensor.calibration.joint import nearest_frame
 from magtensor.calibration.types import Array
 from magtensor.errors import DataError, NotEnoughData
 from magtensor.loop.model import Adopted, Fitting, Record, excitation_of, joint_state, without
+from magtensor.sharing import shared_out
 from magtensor.tensor.assembly import least_squares_assembly
 
 FOLDS = 5
@@ -35,10 +36,9 @@ def held_out_error(
     The error block of `magtensor.accuracy.error_block`; None where the other folds do not determine a calibration.
     """
     n, sensors = len(record.time), len(record.sensors)
-    b = np.empty((n, sensors, 3))
-    reference = np.full(n, np.nan)
     edges = np.linspace(0, n, FOLDS + 1).round().astype(int)
-    for k in range(FOLDS):
+
+    def calibrated_fold(k: int) -> tuple[Array, Array | None] | None:
         test = slice(edges[k], edges[k + 1])
         train = np.array(keep)
         train[test] = False
@@ -50,13 +50,21 @@ def held_out_error(
         x = excitation_of(record, state.fit)
         raw, field = without(record, [a.terms(x) for a in adopted], state.theta)
         matrix = np.linalg.inv(state.fit.forward @ nearest_frame(state.fit.forward))
-        b[test] = np.einsum("sij,nsj->nsi", matrix, raw[test] - state.fit.offset)
-        if field is not None:
-            reference[test] = field[test]
+        return np.einsum("sij,nsj->nsi", matrix, raw[test] - state.fit.offset), None if field is None else field[test]
+
+    folds = shared_out(calibrated_fold, range(FOLDS))
+    b, reference = [], []
+    for fold in folds:
+        if fold is None:
+            return None
+        b.append(fold[0])
+        if fold[1] is not None:
+            reference.append(fold[1])
+    field = np.concatenate(b)
     return error_block(
-        b,
-        reference if record.total_field is not None else None,
-        tensor_of(b, record.position),
+        field,
+        np.concatenate(reference) if reference else None,
+        tensor_of(field, record.position),
         np.repeat(keep[:, None], sensors, axis=1),
         list(record.sensors),
     )

@@ -29,6 +29,7 @@ from magtensor.loop.scoring import Scorer
 from magtensor.loop.separation import SEPARATION, Assessed, lower_orders, lowest
 from magtensor.loop.settings import EventTimes, Range
 from magtensor.loop.terms import Terms, joined
+from magtensor.sharing import shared_out
 
 ALPHA = 0.005  # family-wise probability that a clean survey gets an adoption, before the second gate
 ALONE = 1e-3  # probability that a single test by blocks is passed, which bears noise's own colour out
@@ -151,26 +152,13 @@ def settings_grid(model: Component, x: Excitation) -> list[dict[str, Any]]:
 
 def candidates_of(state: State, models: Sequence[Component], failed: dict[str, str], alpha: float) -> list[Candidate]:
     """The most promising models with their best settings, assessed; their p values corrected for all that was tried."""
-    residual = state.residual
-    now = Whitened.of(residual, state.colours.across, state.colours.along, state.terms)
     scored = _ranked(state, models, failed, alpha)
     names = {s.model.name for s in scored}
-    if len(residual.affine) > REFINING_SAMPLES:
+    if len(state.residual.affine) > REFINING_SAMPLES:
         scored = _scored_on_all(state, scored, failed)
     looked_at = _shortlist(scored, lambda s: s.white, len(names)) + _shortlist(scored, lambda s: s.coloured, len(names))
-    assessed: dict[tuple[str, str], Assessed] = {}
-    for each in looked_at:
-        refined = _refined(each.model, each.settings, state, failed)
-        for settings in (refined, *lower_orders(refined, profiled(each.model))):
-            key = each.model.name, str(settings)
-            if key in assessed:
-                continue
-            terms = _terms(each.model, settings, state.excitation, failed)
-            assert terms is not None
-            terms = terms.at(residual.samples)
-            assessment = assess(now, terms)
-            assessed[key] = Adopted(each.model, settings), each.tried, terms, assessment
-    found = _one_each(state, list(assessed.values()))
+    assessed = _looked_at(state, looked_at, failed)
+    found = _one_each(state, assessed)
     adjusted = _holm([a.p * tried for _, tried, _, a in found], len(names))
     null = _holm([a.null_p * tried for _, tried, _, a in found], len(names))
     candidates = [
@@ -183,12 +171,19 @@ def candidates_of(state: State, models: Sequence[Component], failed: dict[str, s
 def _ranked(state: State, models: Sequence[Component], failed: dict[str, str], alpha: float) -> list[_Screened]:
     """Every model with its best settings and what it explains, of a long survey on a part of the samples."""
     few, more = _Thinned.of(state, SCREENING_SAMPLES), _Thinned.of(state, REFINING_SAMPLES)
-    scored = []
-    for model in models:
-        for settings, tried in _best_settings(model, state, few, failed, alpha / max(len(models), 1)):
-            terms = more.terms(model, settings, failed)
+
+    def ranked(model: Component) -> tuple[list[tuple[dict[str, Any], float, float, float]], dict[str, str]]:
+        rows, fails = [], dict[str, str]()
+        for settings, tried in _best_settings(model, state, few, fails, alpha / max(len(models), 1)):
+            terms = more.terms(model, settings, fails)
             if terms is not None and terms.count:
-                scored.append(_Screened(model, settings, tried, more.white(terms), more.coloured(terms)))
+                rows.append((settings, tried, more.white(terms), more.coloured(terms)))
+        return rows, fails
+
+    scored = []
+    for model, (rows, fails) in zip(models, shared_out(ranked, models), strict=True):
+        scored += [_Screened(model, *row) for row in rows]
+        failed.update(fails)
     return scored
 
 
@@ -197,13 +192,44 @@ def _scored_on_all(state: State, scored: Sequence[_Screened], failed: dict[str, 
     residual = state.residual
     white, coloured = Scorer(residual, state.terms, WHITE), Scorer(residual, state.terms, state.colours)
     first = [sorted(scored, key=key, reverse=True)[:SCREENED] for key in (lambda s: s.white, lambda s: s.coloured)]
-    found = []
-    for each in (s for s in scored if any(s in some for some in first)):
+
+    def on_all(each: _Screened) -> tuple[float, float]:
         terms = _terms(each.model, each.settings, state.excitation, failed)
         assert terms is not None
         terms = terms.at(residual.samples)
-        found.append(replace(each, white=white(terms), coloured=coloured(terms)))
-    return found
+        return white(terms), coloured(terms)
+
+    promising = [s for s in scored if any(s in some for some in first)]
+    found = shared_out(on_all, promising)
+    return [replace(each, white=w, coloured=c) for each, (w, c) in zip(promising, found, strict=True)]
+
+
+def _looked_at(state: State, scored: Sequence[_Screened], failed: dict[str, str]) -> list[Assessed]:
+    """Models with their settings refined, and with lower orders where they have such, assessed on all samples."""
+    residual = state.residual
+    now = Whitened.of(residual, state.colours.across, state.colours.along, state.terms)
+
+    def refined(each: _Screened) -> tuple[dict[str, Any], dict[str, str]]:
+        fails: dict[str, str] = {}
+        return _refined(each.model, each.settings, state, fails), fails
+
+    distinct: dict[tuple[str, str], _Screened] = {}
+    for each, (settings, fails) in zip(scored, shared_out(refined, scored), strict=True):
+        failed.update(fails)
+        for one in (settings, *lower_orders(settings, profiled(each.model))):
+            distinct.setdefault((each.model.name, str(one)), replace(each, settings=one))
+
+    def assessed(each: _Screened) -> tuple[Terms, Assessment]:
+        terms = _terms(each.model, each.settings, state.excitation, failed)
+        assert terms is not None
+        terms = terms.at(residual.samples)
+        return terms, assess(now, terms)
+
+    chosen = list(distinct.values())
+    return [
+        (Adopted(each.model, each.settings), each.tried, terms, assessment)
+        for each, (terms, assessment) in zip(chosen, shared_out(assessed, chosen), strict=True)
+    ]
 
 
 def _holm(values: Sequence[float], models: int) -> list[float]:

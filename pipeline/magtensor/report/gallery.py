@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,6 +12,7 @@ from magtensor.report import attitude_pictures, flag_pictures, noise_pictures, t
 from magtensor.report.content import Content, decoded
 from magtensor.report.drawing import MOST_SENSORS, Picture, picture
 from magtensor.report.tables import pretty
+from magtensor.sharing import shared_out
 
 
 @dataclass(frozen=True)
@@ -87,15 +88,14 @@ def gallery(content: Content) -> list[Picture | Gap]:
     if not len(content.time):
         return [Gap("Pictures over time", "The result holds nothing over time: no stage calibrated the survey.")]
     use = arrays(content)
-    shown: list[Picture | Gap] = [
-        *_residual_pictures(content, use),
-        *_tensor_pictures(content),
-        *_attitude_pictures(content, use),
-        *_noise_pictures(content, use),
-        _reference(content),
-        *_flag_pictures(content, use),
+    import matplotlib.backends.backend_svg  # noqa: F401  here once, rather than in every process
+
+    parts: list[Callable[[], list[Picture | Gap]]] = [
+        lambda: _residual_pictures(content, use),
+        lambda: [*_tensor_pictures(content), *_attitude_pictures(content, use)],
+        lambda: [*_noise_pictures(content, use), _reference(content), *_flag_pictures(content, use)],
     ]
-    return shown
+    return [shown for part in shared_out(lambda part: part(), parts) for shown in part]
 
 
 def _residual_pictures(content: Content, use: Arrays) -> list[Picture | Gap]:

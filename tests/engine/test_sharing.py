@@ -1,0 +1,53 @@
+"""Work is shared out among forked processes, and what they find does not depend on how many there are."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from magtensor.errors import DataError
+from magtensor.sharing import PROCESSES, shared_out
+
+
+@pytest.fixture
+def two(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Two processes, however many cores there are."""
+    monkeypatch.setenv(PROCESSES, "2")
+    yield
+
+
+def test_results_keep_their_order_and_come_from_other_processes(two: None) -> None:
+    big = np.arange(10.0)  # not an argument: the processes know it
+
+    found = shared_out(lambda k: (k, float(big[k] ** 2), os.getpid()), range(8))
+
+    assert [f[:2] for f in found] == [(k, float(k * k)) for k in range(8)]
+    assert os.getpid() not in {f[2] for f in found}
+
+
+def test_without_the_variable_nothing_is_forked(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv(PROCESSES)
+
+    assert shared_out(lambda _: os.getpid(), range(3)) == [os.getpid()] * 3
+
+
+def test_what_is_shared_out_shares_out_nothing_itself(two: None) -> None:
+    found = shared_out(lambda _: [os.getpid(), *shared_out(lambda _: os.getpid(), range(3))], range(4))
+
+    assert all(len(set(each)) == 1 for each in found)
+
+
+def test_an_error_comes_back_as_it_was_raised(two: None) -> None:
+    def refuse(k: int) -> int:
+        if k == 2:
+            raise DataError("too few", where="survey.h5", hint="more would do")
+        return k
+
+    with pytest.raises(DataError, match="too few") as caught:
+        shared_out(refuse, range(4))
+
+    assert (caught.value.where, caught.value.hint) == ("survey.h5", "more would do")
+    assert shared_out(lambda k: k, range(3)) == [0, 1, 2]  # and the next work is not in its way
