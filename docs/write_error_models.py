@@ -35,9 +35,9 @@ A function with the decorator `error_model` is enough. `examples/plugins/feedbac
 for a folder of plugins; `examples/feedback_heating/` is the same as a package of two files that `pip install` brings to
 every recipe.
 
-- The first argument is an `Excitation`: `time`, `elapsed`, `output`, `field`, `channel(name)`, `attitude`, `position`,
-  and what is made of them: `derivative`, `relaxed` (a first-order lag within each run), `lagged` (the same across
-  gaps), `gradient`, `sensed` (what the sensors make of a vector).
+- The first argument is an `Excitation`: `time`, `elapsed`, `output`, `field`, `channel(name, lag_s)` and
+  `thermometer(name, lag_s)`, `attitude`, `position`, and what is made of them: `derivative`, `relaxed` (a first-order
+  lag within each run), `lagged` (the same across gaps), `gradient`, `sensed` (what the sensors make of a vector).
 - It returns `Terms`, most simply by `x.offsets` (a series on every axis), `x.scales` (a series times each axis's own
   output), `x.responses` (a series for each axis), `x.matrices` (a vector through nine coefficients a sensor),
   `x.one_each` (one coefficient a sensor), `x.shared` (one for all), `x.on_reference`; `joined` puts several together.
@@ -46,10 +46,11 @@ every recipe.
 - `needs` names what it cannot do without: channels (`current_*`), `attitude`, `position`, `total_field`, `rotation`
   (samples dense enough for rates of change), `gradient` (a field that differs between the sensors); `a|b` where one of
   two will do.
-- `pointwise=True` says that its regressors at a sample follow from that sample alone; settings with many values are
-  then searched faster. `agrees=function(settings, coefficients)` says whether fitted coefficients are what the settings
-  assume, where both mean one thing; the loop adopts nothing of which they are not. `about=function(settings,
-  coefficients)` gives the settings about which a model that is linear only nearby is to be made for such coefficients.
+- `pointwise=True` says that its regressors at a sample follow from that sample alone (channels and thermometers may be
+  lagged); settings with many values are then searched faster. `agrees=function(settings, coefficients)` says whether
+  fitted coefficients are what the settings assume, where both mean one thing; the loop adopts nothing of which they are
+  not. `about=function(settings, coefficients)` gives the settings about which a model that is linear only nearby is to
+  be made for such coefficients.
 
 `check_error_model(my_model)` of `magtensor.loop.checker` gives a list of everything that is wrong with it; put
 `assert check_error_model(my_model) == []` into your tests.

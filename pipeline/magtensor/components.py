@@ -277,8 +277,8 @@ def error_model(
             `current_*`), `attitude`, `position`, `total_field`, `rotation` (samples dense enough for rates of change).
         source: where the model comes from.
         typical: its usual magnitude, in words.
-        pointwise: its regressors at a sample follow from that sample alone, so that its settings are searched on a
-            few samples only, without the others being computed.
+        pointwise: its regressors at a sample follow from that sample alone (logged channels may be lagged), so that its
+            settings are searched on a few samples only, without the others being computed.
         agrees: of settings and fitted coefficients (P,), whether they are what they must be to each other; the loop
             adopts nothing of which they are not.
         about: of settings and fitted coefficients (P,), the settings about which a model that is linear only nearby

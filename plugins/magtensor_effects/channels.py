@@ -49,7 +49,10 @@ def periodic_interference(
 
 
 @error_model(
-    "instrument", source="power series of a channel", typical="unknown: for channels that nobody wrote a model for"
+    "instrument",
+    source="power series of a channel",
+    typical="unknown: for channels that nobody wrote a model for",
+    pointwise=True,
 )
 def channel_response(
     x: Excitation,
@@ -74,7 +77,7 @@ def channel_response(
     one at power 1.
     """
     name = ANY.pick(x, channel)
-    course = x.lagged(x.channel(name), lag_s) ** power
+    course = x.channel(name, lag_s) ** power
     per_unit = f"({x.units[name]})^{power}" if power > 1 else x.units[name]
     if not x.is_vector(name):
         return x.scales(1e-6 * course, f"ppm/{per_unit}") if times_field else x.offsets(course, f"nT/{per_unit}")

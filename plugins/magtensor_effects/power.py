@@ -20,6 +20,7 @@ Supply = Annotated[str, SUPPLY, Field(description="supply voltage channel; '': t
     needs=("current_*",),
     source="Springmann and Cutler 2012 (RAX); Olsen et al. 2020 (CryoSat-2)",
     typical="16 nT for 1 A in a loop of 100 cm2 at 0.5 m; CryoSat-2 1 to 2 nT",
+    pointwise=True,
 )
 def current_field(
     x: Excitation,
@@ -37,7 +38,7 @@ def current_field(
     is given). Rivals: other currents that switch together; `supply_offset`, for the supply sags under the current.
     """
     name = CURRENT.pick(x, channel)
-    return x.offsets(x.lagged(x.channel(name), lag_s), f"nT/{x.units[name]}")
+    return x.offsets(x.channel(name, lag_s), f"nT/{x.units[name]}")
 
 
 @error_model("instrument", needs=("supply*",), source="dependence of the excitation on the supply", typical="10 ppm/V")

@@ -132,8 +132,7 @@ def passing_source(
     u = (x.elapsed - time_s) / passage_s
     dipole = [u**k / (1 + u**2) ** 2.5 for k in range(3)]
     if not whole:
-        along = x.sensed(x.field / np.linalg.norm(x.field, axis=2, keepdims=True))
-        return joined([x.shared(f[:, None, None] * along, "nT", f"u{k}") for k, f in enumerate(dipole)])
+        return joined([x.shared(f[:, None, None] * x.along, "nT", f"u{k}") for k, f in enumerate(dipole)])
     axes = _world_axes(x)
     places = _places(x, axes)
     patterns = [(AXES[i], "nT", np.broadcast_to(axis, x.output.shape), dipole) for i, axis in enumerate(np.eye(3))]

@@ -27,6 +27,7 @@ ThermalLag = Annotated[
     needs=("temperature*",),
     source="first-order thermal lag; coefficients as in Olsen et al. 2020 (CryoSat-2)",
     typical="0.1 nT/degC for a good fluxgate; thermal lags of minutes",
+    pointwise=True,
 )
 def temperature_offset(x: Excitation, *, order: Order = 1, channel: Thermometer = "", lag_s: ThermalLag = 0.0) -> Terms:
     """Each axis's offset follows the temperature of the sensor, which lags the thermometer.
@@ -37,7 +38,7 @@ def temperature_offset(x: Excitation, *, order: Order = 1, channel: Thermometer 
     short lags.
     """
     name = THERMOMETER.pick(x, channel)
-    course = x.lagged(x.thermometer(name), lag_s)
+    course = x.thermometer(name, lag_s)
     return joined([x.offsets(course**k, f"nT/{units}", label) for k, units, label in _powers(x.units[name], order)])
 
 
@@ -46,6 +47,7 @@ def temperature_offset(x: Excitation, *, order: Order = 1, channel: Thermometer 
     needs=("temperature*",),
     source="Toffner-Clausen et al. 2016 (Swarm); Olsen et al. 2020 (CryoSat-2)",
     typical="20 ppm/degC for a fluxgate, 100 for an orthogonal one, below 1 for Swarm after correction",
+    pointwise=True,
 )
 def temperature_scale(x: Excitation, *, order: Order = 1, channel: Thermometer = "", lag_s: ThermalLag = 0.0) -> Terms:
     """Each axis's scale factor follows the temperature of the sensor, which lags the thermometer.
@@ -54,7 +56,7 @@ def temperature_scale(x: Excitation, *, order: Order = 1, channel: Thermometer =
     `temperature_offset` where the attitude hardly changes; `scale_drift` where the temperature rises steadily.
     """
     name = THERMOMETER.pick(x, channel)
-    course = x.lagged(x.thermometer(name), lag_s)
+    course = x.thermometer(name, lag_s)
     powers = _powers(x.units[name], order)
     return joined([x.scales(1e-6 * course**k, f"ppm/{units}", label) for k, units, label in powers])
 
@@ -64,6 +66,7 @@ def temperature_scale(x: Excitation, *, order: Order = 1, channel: Thermometer =
     needs=("temperature*",),
     source="Toffner-Clausen et al. 2016 (Swarm: currents driven by the Sun)",
     typical="a nT where sun and shade alternate (Swarm: 1.05 nT rms with it, 0.55 without)",
+    pointwise=True,
 )
 def temperature_rate(
     x: Excitation,
@@ -82,8 +85,7 @@ def temperature_rate(
     axis. Rival: `temperature_offset` with a lag.
     """
     name = THERMOMETER.pick(x, channel)
-    skin = x.thermometer(name)
-    return x.offsets(skin - x.lagged(skin, tau_s), f"nT/{x.units[name]}")
+    return x.offsets(x.thermometer(name) - x.thermometer(name, tau_s), f"nT/{x.units[name]}")
 
 
 def _powers(units: str, order: int) -> list[tuple[int, str, str]]:

@@ -95,6 +95,7 @@ def fit_recording(
     worst_error: float = WORST_ERROR,
     keep: Mask | None = None,
     complete: bool = True,
+    known: Coverage | None = None,
 ) -> JointFit:
     """Fit C and o of all sensors to a recording of their outputs and the total field.
 
@@ -108,6 +109,7 @@ def fit_recording(
     complete: the model is believed to hold all there is, so that a misfit is noise, whose colour is then found
         (later: `with_colour`). Where it is not, an effect that no one has added yet must not pass for a lack of
         attitudes.
+    known: what was found of the same attitudes before, which are not judged again then.
 
     Raises
     ------
@@ -131,13 +133,15 @@ def fit_recording(
                 used = np.zeros(recording.count, dtype=bool)
                 used[chosen] = begun.keep
                 raw, total_field = part.raw[begun.keep], part.total_field[begun.keep]
-                found = _accepted(begun.plane, begun.scalar, used, raw, total_field, worst_error, level)
+                found = _accepted(begun.plane, begun.scalar, used, raw, total_field, worst_error, level, known)
                 return with_colour(found, raw, total_field, reference_noise) if complete else found
             limits = limits_of(begun, part, reference_noise, count) if judge else None
             whole = fit_whole(
                 recording, begun.plane, begun.scalar, limits=limits, reference_noise=reference_noise, keep=allowed
             )
-            found = _accepted(whole.plane, whole.scalar, whole.keep, whole.raw, whole.total_field, worst_error, level)
+            found = _accepted(
+                whole.plane, whole.scalar, whole.keep, whole.raw, whole.total_field, worst_error, level, known
+            )
             return _coloured(found, whole.blocks) if complete else found
         except NotEnoughData:
             # what a selection lacks, the rest may hold
@@ -154,10 +158,13 @@ def _accepted(
     total_field: Array,
     worst_error: float,
     level: float | None,
+    known: Coverage | None,
 ) -> JointFit:
     """The fit, once the samples raw (n, S, 3) and total_field (n,), an even choice of those used, have been found to
     determine it."""
     forward, offset = unfolded(plane, scalar)
+    if known is not None:
+        return JointFit(forward, offset, plane, scalar, keep, known)
     # judged on the calibrated field, whose axes are nearest to those of the sensors
     field = scalar.field(plane.coordinates(raw)) @ nearest_frame(forward)
     found = coverage(

@@ -132,20 +132,16 @@ def likeliest(residual: Residual, terms: Terms, guesses: Sequence[Colours], firs
     first: (P,) coefficients in noise of the first guess, where they are known.
     """
     found: list[Likeliest] = []
-    for number, colours in enumerate(guesses):
-        if any(_alike(colours, before) for before in guesses[:number]):
-            continue
+    begun: list[Colours] = []
+    for colours in guesses:
         for _ in range(_ROUNDS):
-            if first is not None and colours is guesses[0]:
-                theta = first
-            else:
-                theta = estimated(residual, terms, colours).theta
+            if any(_alike(colours, before) for before in begun):
+                break  # where this leads is known
+            begun.append(colours)
+            theta = first if first is not None and len(begun) == 1 else estimated(residual, terms, colours).theta
             left = taken_off(residual, terms, theta)
-            after = colours_of(left, stiff=True)
-            found.append(Likeliest(theta, after, log_likelihood(left, after)))
-            if _alike(after, colours):
-                break
-            colours = after
+            colours = colours_of(left, stiff=True)
+            found.append(Likeliest(theta, colours, log_likelihood(left, colours)))
     return max(found, key=lambda each: each.log_likelihood)
 
 

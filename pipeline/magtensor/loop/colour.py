@@ -8,9 +8,12 @@ which keeps trends from leaking round the ends.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
+from numpy.typing import NDArray
 
 from magtensor.calibration.types import Array
 
@@ -104,7 +107,7 @@ def colour_of(series: Array, freedom: float | None = None, *, stiff: bool = Fals
     if white <= 0:
         white = float(np.min(model))
     every = np.concatenate([[frequency[0] / 2], frequency])
-    total = white + shapes_of(every, n)[:, 1:] @ found[1:]
+    total = white + shapes_of(every, n, found[1:] > 0)[:, 1:] @ found[1:][found[1:] > 0]
     relative = np.maximum(total / white, 1.0)
     if relative[1] < 1.05:
         return Colour(None, white)
@@ -125,21 +128,36 @@ def beside_the_field(series: Array, affine: Array) -> tuple[Array, Colour]:
     return left, colour
 
 
-def _relaxations(frequency: Array, n: int) -> Array:
-    """White noise and first-order processes of time constants from two samples to ten surveys, (M, 1 + Q)."""
+def _relaxations(frequency: Array, n: int, chosen: NDArray[np.bool_] | None = None) -> Array:
+    """White noise and first-order processes of time constants from two samples to ten surveys, (M, 1 + Q), or of these
+    processes the chosen ones (Q,)."""
     taus = np.geomspace(2.0, 10.0 * n, 3 * max(2, int(np.log10(n))))
-    return np.column_stack([np.ones_like(frequency), *[_relaxation(frequency, t) for t in taus]])
+    return _beside_white(frequency, [partial(_relaxation, tau=t) for t in taus], chosen)
 
 
-def _laws(frequency: Array, n: int) -> Array:
-    """White noise, 1/f and 1/f^2, each 1 at the survey's own frequency, and short first-order processes, (M, 3 + Q).
+def _laws(frequency: Array, n: int, chosen: NDArray[np.bool_] | None = None) -> Array:
+    """White noise, 1/f and 1/f^2, each 1 at the survey's own frequency, and short first-order processes, (M, 1 + Q), or
+    of all but the white noise the chosen ones (Q,).
 
     A base station that is read more seldom than the sensors leaves noise with a plateau, which the laws alone would
     take for the beginning of a steep rise.
     """
-    slow = 1.0 / (2.0 * n * frequency)
     short = _SHORT[n > _LEAST_OF_SHORT * _SHORT]
-    return np.column_stack([np.ones_like(frequency), slow, slow**2, *[_relaxation(frequency, t) for t in short]])
+    laws = [partial(_power_law, n=n, exponent=1), partial(_power_law, n=n, exponent=2)]
+    return _beside_white(frequency, [*laws, *(partial(_relaxation, tau=t) for t in short)], chosen)
+
+
+def _beside_white(
+    frequency: Array, shapes: Sequence[Callable[[Array], Array]], chosen: NDArray[np.bool_] | None
+) -> Array:
+    wanted = shapes if chosen is None else [shape for shape, yes in zip(shapes, chosen, strict=True) if yes]
+    return np.column_stack([np.ones_like(frequency), *(shape(frequency) for shape in wanted)])
+
+
+def _power_law(frequency: Array, n: int, exponent: int) -> Array:
+    """Power of 1 / frequency, 1 at the survey's own frequency."""
+    out: Array = (1.0 / (2.0 * n * frequency)) ** exponent
+    return out
 
 
 def _relaxation(frequency: Array, tau: float) -> Array:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -100,23 +101,20 @@ class Whitened:
 
     Attributes:
         residual: of N samples; across, along: the colours of its two parts.
-        z, e: (N, A) affine functions and (N, 3 S) the residual across; None for a single sensor.
-        inner, r: (N, 3 A) and (N,) along; None without a total field.
         given: terms that are in already; None without any.
-        series, columns: their series (N, K) across and columns along; None where there are none.
+        known_across: (N, A + K + 3 S) the affine functions, the series of the given terms and the residual across; None
+            for a single sensor.
+        known_along: (N, 3 A + P + 1) the fit's own freedom, the columns of the given terms and the residual along; None
+            without a total field.
         over_time: whether the rows are samples; where only sums over all of them are asked for they need not be.
     """
 
     residual: Residual
     across: Colour
     along: Colour | TurnedColour
-    z: Array | None
-    e: Array | None
-    inner: Array | None
-    r: Array | None
-    given: Terms | None = None
-    series: Array | None = None
-    columns: Columns | None = None
+    given: Terms | None
+    known_across: Array | None
+    known_along: Array | None
     over_time: bool = True
 
     @classmethod
@@ -129,29 +127,47 @@ class Whitened:
         *,
         over_time: bool = True,
     ) -> Whitened:
-        z = e = inner = r = None
+        known_across = known_along = None
         if residual.across is not None:
-            z, e = across.whiten(residual.affine, back=over_time), across.whiten(residual.across, back=over_time)
+            series = [] if given is None else [given.series * _seen_across(given)]
+            known = np.hstack([residual.affine, *series, residual.across])
+            known_across = across.whiten(known, back=over_time)
         if residual.along is not None:
-            both = along.whiten(np.column_stack([residual.inner, residual.along]), back=over_time)
-            inner, r = both[:, :-1], both[:, -1]
-        white = cls(residual, across, along, z, e, inner, r, over_time=over_time)
-        if given is None:
-            return white
-        return replace(white, given=given, series=white.series_of(given), columns=white.columns_of(given))
+            columns = [] if given is None else [_made(along_the_field(residual, given))]
+            known = np.hstack([residual.inner, *columns, residual.along[:, None]])
+            known_along = along.whiten(known, back=over_time)
+        return cls(residual, across, along, given, known_across, known_along, over_time)
 
-    def series_of(self, terms: Terms) -> Array | None:
-        """(N, K) whitened as the residual across; None where it does not see them."""
-        if self.e is None or not (terms.part_output != REFERENCE).any():
-            return None
-        return self.across.whiten(terms.series, back=self.over_time)
+    @cached_property
+    def _sums(self) -> dict[int, tuple[Array | None, Array | None]]:
+        return {}
 
-    def columns_of(self, terms: Terms) -> Columns | None:
-        """Whitened as the residual along; None where there is none."""
-        if self.r is None:
-            return None
-        found = along_the_field(self.residual, terms)
-        return replace(found, base=self.along.whiten(found.base, back=self.over_time))
+    def sums(self, blocks: int) -> tuple[Array | None, Array | None]:
+        """(B, ., .) products of all that is known across with each other, and of all that is known along."""
+        if blocks not in self._sums:
+            known = self.known_across, self.known_along
+            first, second = (None if k is None else _products(k, k, self.edges(blocks)) for k in known)
+            self._sums[blocks] = first, second
+        return self._sums[blocks]
+
+    def edges(self, blocks: int) -> NDArray[np.int_]:
+        """(B + 1,) where blocks begin and end."""
+        assert self.over_time or blocks == 1
+        return np.linspace(0, len(self.residual.affine), blocks + 1).round().astype(int)
+
+
+def _seen_across(terms: Terms) -> float:
+    return 1.0 if (terms.part_output != REFERENCE).any() else 0.0
+
+
+def _made(columns: Columns) -> Array:
+    out: Array = columns.base @ columns.mix
+    return out
+
+
+def _products(a: Array, b: Array, edges: NDArray[np.int_]) -> Array:
+    """(B, K, L) products of the columns of (N, K) and (N, L) in each block."""
+    return np.stack([a[i:j].T @ b[i:j] for i, j in itertools.pairwise(edges)])
 
 
 def grams(residual: Residual, terms: Terms, across: Colour, along: Colour | TurnedColour, blocks: int = 1) -> Grams:
@@ -167,57 +183,43 @@ def grams(residual: Residual, terms: Terms, across: Colour, along: Colour | Turn
 
 def grams_in(white: Whitened, terms: Terms | None, blocks: int = 1) -> Grams:
     """The same of the terms that are in a whitened residual already, and of more where there are any."""
-    from scipy.linalg import block_diag
-
-    residual = white.residual
-    assert white.over_time or blocks == 1
-    together = joined([t for t in (white.given, terms) if t is not None])
-    n, size = len(residual.affine), len(residual.noise)
-    edges = np.linspace(0, n, blocks + 1).round().astype(int)
-    pieces = list(itertools.pairwise(edges))
-    k, p, own = together.series.shape[1], together.count, residual.affine.shape[1]
+    residual, given, edges = white.residual, white.given, white.edges(blocks)
+    together = joined([t for t in (given, terms) if t is not None])
+    own, size = residual.affine.shape[1], len(residual.noise)
+    k, p = together.series.shape[1], together.count
     zz, zd, dd = np.zeros((blocks, own, own)), np.zeros((blocks, own, k)), np.zeros((blocks, k, k))
     ze, de, ee = np.zeros((blocks, own, size)), np.zeros((blocks, k, size)), np.zeros(blocks)
-    if white.z is not None and white.e is not None:
-        z, e = white.z, white.e
-        d = _beside(white.series, white.given, terms, white.series_of)
-        for i, (a, b) in enumerate(pieces):
-            zz[i], ze[i], ee[i] = z[a:b].T @ z[a:b], z[a:b].T @ e[a:b], np.sum(e[a:b] ** 2)
-            zd[i], dd[i], de[i] = z[a:b].T @ d[a:b], d[a:b].T @ d[a:b], d[a:b].T @ e[a:b]
     aa, ar, rr = np.zeros((blocks, 3 * own + p, 3 * own + p)), np.zeros((blocks, 3 * own + p)), np.zeros(blocks)
-    if white.inner is not None and white.r is not None:
-        columns = [Columns(white.inner, np.eye(3 * own))]
-        columns += [c for c in (white.columns, None if terms is None else white.columns_of(terms)) if c is not None]
-        base, mix = np.hstack([c.base for c in columns]), block_diag(*(c.mix for c in columns))
-        for i, (a, b) in enumerate(pieces):
-            part, r = base[a:b], white.r[a:b]
-            aa[i], ar[i], rr[i] = mix.T @ (part.T @ part) @ mix, (part.T @ r) @ mix, r @ r
+    across, along = white.sums(blocks)
+    if across is not None and white.known_across is not None:
+        m = across.shape[1] - size  # z and the series of the given terms
+        zz, ze, ee = across[:, :own, :own], across[:, :own, m:], np.trace(across[:, m:, m:], axis1=1, axis2=2)
+        zd[:, :, : m - own], dd[:, : m - own, : m - own] = across[:, :own, own:m], across[:, own:m, own:m]
+        de[:, : m - own] = across[:, own:m, m:]
+        if terms is not None and _seen_across(terms):
+            d = white.across.whiten(terms.series, back=white.over_time)
+            new, seen = slice(m - own, None), _products(white.known_across, d, edges)
+            zd[:, :, new], de[:, new] = seen[:, :own], seen[:, m:].swapaxes(1, 2)
+            dd[:, : m - own, new], dd[:, new, : m - own] = seen[:, own:m], seen[:, own:m].swapaxes(1, 2)
+            dd[:, new, new] = _products(d, d, edges)
+    if along is not None and white.known_along is not None:
+        m = along.shape[1] - 1  # the fit's own freedom and the columns of the given terms
+        aa[:, :m, :m], ar[:, :m], rr = along[:, :m, :m], along[:, :m, m], along[:, m, m]
+        if terms is not None:
+            columns = along_the_field(residual, terms)
+            base, mix = white.along.whiten(columns.base, back=white.over_time), columns.mix
+            seen = _products(white.known_along, base, edges) @ mix
+            aa[:, :m, m:], aa[:, m:, :m], ar[:, m:] = seen[:, :m], seen[:, :m].swapaxes(1, 2), seen[:, m]
+            aa[:, m:, m:] = mix.T @ _products(base, base, edges) @ mix
     if residual.sighted is not None:
-        every, off = (
-            np.hstack([residual.sighted.inner, across_directions(residual, together)]),
-            residual.sighted.residual,
-        )
-        for i, (a, b) in enumerate(pieces):
-            part, r = every[2 * a : 2 * b], off[2 * a : 2 * b]
-            aa[i], ar[i], rr[i] = aa[i] + part.T @ part, ar[i] + part.T @ r, rr[i] + r @ r
-    samples = np.diff(edges).astype(float)
+        every = np.hstack([residual.sighted.inner, across_directions(residual, together)])
+        off = residual.sighted.residual
+        aa, ar = aa + _products(every, every, 2 * edges), ar + _products(every, off[:, None], 2 * edges)[:, :, 0]
+        rr = rr + _products(off[:, None], off[:, None], 2 * edges)[:, 0, 0]
     return Grams(
-        zz, zd, dd, ze, de, ee, aa, ar, rr, samples,
+        zz, zd, dd, ze, de, ee, aa, ar, rr, np.diff(edges).astype(float),
         together.part_term, together.part_output, together.part_series, p, residual.projector, residual.noise,
     )  # fmt: skip
-
-
-def _beside(
-    known: Array | None, given: Terms | None, terms: Terms | None, whitened: Callable[[Terms], Array | None]
-) -> Array:
-    """(N, K) the series of the given terms and of more; zero where the residual across does not see them."""
-    parts = []
-    if given is not None:
-        parts.append(np.zeros_like(given.series) if known is None else known)
-    if terms is not None:
-        more = whitened(terms)
-        parts.append(np.zeros_like(terms.series) if more is None else more)
-    return parts[0] if len(parts) == 1 else np.hstack(parts)
 
 
 def along_the_field(residual: Residual, terms: Terms) -> Columns:

@@ -39,6 +39,7 @@ class Excitation:
         attitude: (N, 4) scalar last, platform to world; None where not known.
         lines: Hz, the strongest lines in the residual's spectrum, for models that look for one.
         waveform: (N,) of a source that nobody logged, found in what the sensors share; None where none was.
+        part_of: what this is a part of, and the numbers of the samples in it; None for a whole survey.
     """
 
     time: Array
@@ -55,9 +56,11 @@ class Excitation:
     attitude: Array | None = None
     lines: Sequence[float] = ()
     waveform: Array | None = None
+    part_of: tuple[Excitation, NDArray[np.int_]] | None = None
 
     def at(self, samples: NDArray[np.int_]) -> Excitation:
-        """What an error model sees that looks at some of the samples only, each by itself."""
+        """What an error model sees that looks at some of the samples only, each by itself. Logged channels are seen
+        through lags as in the whole survey."""
         chosen = replace(
             self,
             time=self.time[samples],
@@ -69,6 +72,7 @@ class Excitation:
             segment=self.segment[samples],
             attitude=None if self.attitude is None else self.attitude[samples],
             waveform=None if self.waveform is None else self.waveform[samples],
+            part_of=(self, samples),
         )
         vars(chosen)["matrix"] = self.matrix  # that of all samples
         return chosen
@@ -92,24 +96,35 @@ class Excitation:
         """The logged channels whose names fit."""
         return sorted(n for n in self.logged if fnmatchcase(n, pattern) and not any(fnmatchcase(n, w) for w in without))
 
-    def channel(self, name: str) -> Array:
-        """A logged channel, (N,), (N, S) or (N, 3).
+    def channel(self, name: str, lag_s: float = 0.0) -> Array:
+        """A logged channel, (N,), (N, S) or (N, 3), seen through a lag as in `lagged`.
 
         Raises:
             KeyError: there is none of that name.
         """
         if name not in self.logged:
             raise KeyError(f"no channel {name}{did_you_mean(name, self.logged)}")
-        return self.logged[name]
+        return self._course(name, lag_s, smooth=False) if lag_s else self.logged[name]
 
-    def thermometer(self, name: str) -> Array:
-        """A logged temperature without the noise of its log: what has a thermal mass does not jump, neither between
-        samples nor where a log that is written seldom has a new value."""
-        if name not in self._quiet:
-            values = self.channel(name)
-            columns = [unheld(self.time, column) for column in values.reshape(len(values), -1).T]
-            self._quiet[name] = np.column_stack(columns).reshape(values.shape)
-        return self._quiet[name]
+    def thermometer(self, name: str, lag_s: float = 0.0) -> Array:
+        """A logged temperature without the noise of its log, seen through a lag: what has a thermal mass does not jump,
+        neither between samples nor where a log that is written seldom has a new value."""
+        return self._course(name, lag_s, smooth=True)
+
+    def _course(self, name: str, lag_s: float, smooth: bool) -> Array:
+        if self.part_of is not None:
+            whole, samples = self.part_of
+            return whole._course(name, lag_s, smooth)[samples]
+        key = name, lag_s, smooth
+        if key not in self._courses:
+            if lag_s:
+                found = self.lagged(self._course(name, 0.0, smooth), lag_s)
+            else:
+                values = self.channel(name)
+                columns = [unheld(self.time, c) if smooth else c for c in values.reshape(len(values), -1).T]
+                found = np.column_stack(columns).reshape(values.shape)
+            self._courses[key] = found
+        return self._courses[key]
 
     def is_vector(self, name: str) -> bool:
         """Whether a logged channel has a value for each axis rather than one, or one for each sensor."""
@@ -117,7 +132,7 @@ class Excitation:
         return len(shape) == 2 and shape[1] == 3 and (len(self.sensors) != 3 or name in VECTORS)
 
     @cached_property
-    def _quiet(self) -> dict[str, Array]:
+    def _courses(self) -> dict[tuple[str, float, bool], Array]:
         return {}
 
     @cached_property
@@ -148,6 +163,11 @@ class Excitation:
         each = vectors[:, None] if vectors.ndim == 2 else vectors
         out: Array = np.einsum("sij,nsj->nsi", self.matrix, np.broadcast_to(each, self.output.shape))
         return out
+
+    @cached_property
+    def along(self) -> Array:
+        """(N, S, 3): what the sensors make of a unit vector along the field."""
+        return self.sensed(self.field / np.linalg.norm(self.field, axis=2, keepdims=True))
 
     @cached_property
     def gradient(self) -> Array:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtensor.calibration import joint
+from magtensor.calibration.coverage import Coverage
 from magtensor.calibration.joint import JointFit, fit_joint, nearest_frame
 from magtensor.calibration.nominal import Nominal, fit_nominal
 from magtensor.calibration.types import Array
@@ -204,8 +205,10 @@ def joint_state(
     raw, reference = record.raw, record.total_field
     estimate: Estimate | None = None
     terms: Terms | None = None
+    known: Coverage | None = None
     for round_ in range(MOST_ROUNDS):
-        fit = _fit(record, raw, reference, how, keep)
+        fit = _fit(record, raw, reference, how, keep, known if round_ + 1 < MOST_ROUNDS else None)
+        known = fit.coverage  # between the first fit and the last nobody asks
         x = excitation_of(record, fit, lines)
         if not adopted:
             break
@@ -253,7 +256,14 @@ def share_of(residual: Residual, terms: Terms, step: Array, colours: Colours) ->
     return 0.0
 
 
-def _fit(record: Record, raw: Array, reference: Array | None, how: Fitting, keep: NDArray[np.bool_] | None) -> JointFit:
+def _fit(
+    record: Record,
+    raw: Array,
+    reference: Array | None,
+    how: Fitting,
+    keep: NDArray[np.bool_] | None,
+    known: Coverage | None = None,
+) -> JointFit:
     assert reference is not None and record.total_field is not None and record.quiet_field is not None
     loud = record.total_field - record.quiet_field
 
@@ -263,7 +273,7 @@ def _fit(record: Record, raw: Array, reference: Array | None, how: Fitting, keep
             "worst_error": how.worst_error if how.complete else _SLACK * how.worst_error,
         }  # fmt: skip
         if how.nominal is None:
-            return fit_joint(raw, reference, **options)
+            return fit_joint(raw, reference, known=known, **options)
         return fit_nominal(raw, reference, how.nominal, quiet_field=reference - loud, **options)
 
     try:

@@ -23,6 +23,8 @@ from magtensor.calibration.types import Array
 from magtensor.loop.terms import Terms
 from magtensor.loop.turned import SlowModes
 
+_INNER_RANK = 1e-9  # of the largest singular value
+
 
 @dataclass(frozen=True)
 class Sighted:
@@ -102,6 +104,19 @@ class Residual:
     def projector(self) -> Array:
         """(3 S, 3 S) off the plane."""
         out: Array = np.eye(len(self.basis)) - self.basis @ self.basis.T
+        return out
+
+    @cached_property
+    def free_across(self) -> Array:
+        """(N, A) orthonormal: what the fit's own freedom can explain of each output across."""
+        return np.asarray(np.linalg.qr(self.affine)[0])
+
+    @cached_property
+    def free_along(self) -> Array:
+        """(N, 3 A - 3) orthonormal: the same along; with known directions (3 N, 3 A), theirs after it."""
+        rows = self.inner if self.sighted is None else np.concatenate([self.inner, self.sighted.inner])
+        basis, size, _ = np.linalg.svd(rows, full_matrices=False)
+        out: Array = basis[:, size > _INNER_RANK * size[0]]
         return out
 
     @cached_property
@@ -207,16 +222,16 @@ def taken_off(residual: Residual, terms: Terms, theta: Array) -> Residual:
     raw = terms.contribution(theta, len(residual.noise)) / residual.noise
     if across is not None:
         across = across - raw @ residual.projector
-        across = across - residual.affine @ np.linalg.lstsq(residual.affine, across, rcond=None)[0]
+        across = across - residual.free_across @ (residual.free_across.T @ across)
     if along is not None:
         on_reference = terms.on_reference(theta)
         moved = np.einsum("no,no->n", residual.gain, raw) + residual.reference_gain * on_reference
-        off, rows = along - (moved if residual.levels is None else residual.levels.off(moved)), residual.inner
+        off = along - (moved if residual.levels is None else residual.levels.off(moved))
         if sighted is not None:
             turned = np.einsum("nj,nj->n", sighted.response, np.repeat(raw @ residual.basis, 2, axis=0))
             turned += sighted.reference_gain * np.repeat(on_reference, 2)
-            off, rows = np.concatenate([off, sighted.residual - turned]), np.concatenate([rows, sighted.inner])
-        off = off - rows @ np.linalg.lstsq(rows, off, rcond=1e-9)[0]
+            off = np.concatenate([off, sighted.residual - turned])
+        off = off - residual.free_along @ (residual.free_along.T @ off)
         along = off[: len(along)]
         sighted = None if sighted is None else replace(sighted, residual=off[len(along) :])
     return replace(residual, across=across, along=along, sighted=sighted)
