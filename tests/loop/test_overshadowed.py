@@ -45,6 +45,19 @@ def test_larger_effects_and_those_that_do_not_follow_the_attitude_are_kept_besid
     assert told["unexplained"]["present"] and told["unexplained"]["excess_rms_nT"] > 0.5
 
 
+def test_what_happens_once_overshadows_nothing(tmp_path: Path) -> None:
+    passing = {
+        "type": "passing_source",
+        "time_s": 500.0,
+        "closest_m": [12.0, 0.0, 0.0],
+        "velocity_m_s": [0.0, 0.5, 0.0],
+    }
+    effects = ({"type": "nonlinearity_quadratic", "rms_nT": 0.15}, passing | {"rms_nT": 0.6})
+    told = verdict_of(tmp_path, scenario(25, *effects, motion=SHORT), models=(*MODELS, "passing_source"))
+    assert "nonlinearity_quadratic" in adopted_names(told)
+    assert adopted_names(told) <= {"nonlinearity_quadratic", "passing_source"}
+
+
 def test_how_much_of_an_effect_follows_the_attitude(tmp_path: Path) -> None:
     effects = [
         {"type": "eddy_current", "rms_nT": 1.0},

@@ -11,10 +11,10 @@ from magtensor.components import Component
 from magtensor.errors import DataError, NotEnoughData, UsageError, did_you_mean
 from magtensor.loop.adopting import adopt
 from magtensor.loop.assessment import estimated
-from magtensor.loop.contribution import removal
+from magtensor.loop.contribution import removal, without_models
 from magtensor.loop.found import Step
 from magtensor.loop.latent import NAME, renewed, sought, tried_source
-from magtensor.loop.model import Fitting, Record, State, joint_state
+from magtensor.loop.model import Fitting, Record, State
 from magtensor.loop.outcome import why
 from magtensor.loop.screening import Candidate, candidates_of, profiled
 from magtensor.loop.search import simplest
@@ -93,11 +93,9 @@ def taken_out(record: Record, state: State, places: Sequence[int], how: Fitting)
     for i in places:
         worse, better = removal(state, i)
         parts.append(f"held-out residual {better:.4g} nT with it, {worse:.4g} nT without")
-    rest = [i for i in range(len(state.adopted)) if i not in places]
     if NAME in {state.adopted[i].name for i in places}:
         record = replace(record, waveform=None)
-    left = joint_state(record, [state.adopted[i] for i in rest], how, [state.theta[i] for i in rest])
-    record, left = renewed(record, left, how)
+    record, left = renewed(record, without_models(record, state, places, how), how)
     return ByHand(f"taken out again: {'; '.join(parts)}", record, left, None)
 
 

@@ -76,6 +76,11 @@ def eliminate(record: Record, state: State, how: Fitting, fixed: int) -> tuple[S
         else:
             break
         dropped.append(state.adopted[weakest].name)
-        rest = [i for i in range(len(state.adopted)) if i != weakest]
-        state = joint_state(record, [state.adopted[i] for i in rest], how, [state.theta[i] for i in rest])
+        state = without_models(record, state, [weakest], how)
     return state, tuple(dropped)
+
+
+def without_models(record: Record, state: State, places: Sequence[int], how: Fitting) -> State:
+    """The fit without some of its models."""
+    rest = [i for i in range(len(state.adopted)) if i not in places]
+    return joint_state(record, [state.adopted[i] for i in rest], how, [state.theta[i] for i in rest], state.lines)

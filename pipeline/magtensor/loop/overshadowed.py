@@ -13,18 +13,22 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from magtensor.calibration.types import Array
+from magtensor.loop.assessment import estimated
 from magtensor.loop.contribution import removal, slices
 from magtensor.loop.direction import attitude_series
 from magtensor.loop.found import Search
 from magtensor.loop.model import State
-from magtensor.loop.unexplained import excess_rms, unexplained
+from magtensor.loop.residual import taken_off
+from magtensor.loop.terms import joined
+from magtensor.loop.unexplained import unexplained
 
 MOSTLY = 0.5  # of what an effect adds: so much of it, predicted from the attitude, follows the attitude
 
 
 def overshadowed(found: Search, fixed: int) -> tuple[str, str] | None:
     """The weakest effect that follows the attitude and explains less than what stays, and why it is doubted."""
-    state, left = found.last, excess_rms(found.last)
+    state, left = found.last, staying(found)
     weakest: tuple[float, str] | None = None
     for name in dict.fromkeys(a.name for a in state.adopted[fixed:]):
         places = [i for i, a in enumerate(state.adopted) if a.name == name and i >= fixed]
@@ -38,18 +42,40 @@ def overshadowed(found: Search, fixed: int) -> tuple[str, str] | None:
     return name, f"it follows the attitude and explains {amount:.3g} nT rms, less than the {left:.3g} nT that stay"
 
 
+def staying(found: Search) -> float:
+    """nT rms above the white noise that stays and may follow the attitude: without what a significant effect of
+    something else would explain, which was not adopted because it happens once."""
+    state, residual = found.last, found.last.residual
+    other = 0.0
+    for candidate in found.steps[-1].candidates if found.steps else ():
+        if max(candidate.adjusted_p, candidate.adjusted_null_p) >= candidate.alpha:
+            continue
+        terms = candidate.model.terms(state.excitation).at(residual.samples)
+        together = terms if state.terms is None else joined([state.terms, terms])
+        theta = estimated(residual, together, state.colours).theta
+        explained = residual.square() - taken_off(residual, together, theta).square()
+        own = terms.contribution(theta[together.count - terms.count :], len(residual.noise))
+        if explained > other and attitude_part(state, own) <= MOSTLY:
+            other = explained
+    return float(np.sqrt(max(residual.square() - 1.0 - other, 0.0)) * residual.scale)
+
+
 def attitude_share(state: State, places: Sequence[int]) -> float:
     """How much of the variance of what adopted models add can be predicted from the attitude, whatever the law."""
     assert state.terms is not None
-    residual = state.residual
     theta = np.zeros(state.terms.count)
     for place in places:
         part = slices(state)[place]
         theta[part] = state.theta[place]
-    added = state.terms.contribution(theta, len(residual.noise)) / residual.noise
-    own = np.linalg.qr(residual.affine)[0]
+    return attitude_part(state, state.terms.contribution(theta, len(state.residual.noise)))
+
+
+def attitude_part(state: State, added: Array) -> float:
+    """The same of series (N, 3 S) nT that are added to the outputs at the residual's samples."""
+    residual = state.residual
     series = attitude_series(state.excitation)[residual.samples]
-    added, series = (x - own @ (own.T @ x) for x in (added, series))
+    own = residual.free_across
+    added, series = (x - own @ (own.T @ x) for x in (added / residual.noise, series))
     follows = np.linalg.lstsq(series, added, rcond=None)[0]
     total = float(np.sum(added**2))
     return 1.0 - float(np.sum((added - series @ follows) ** 2)) / total if total > 0 else 0.0

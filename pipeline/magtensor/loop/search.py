@@ -15,7 +15,8 @@ from magtensor.components import Component
 from magtensor.errors import DataError
 from magtensor.loop.adopting import adopt, narrowed, polished
 from magtensor.loop.changing_matrix import channel_instead
-from magtensor.loop.contribution import eliminate
+from magtensor.loop.contribution import eliminate, without_models
+from magtensor.loop.exchange import looked_at_again, simpler
 from magtensor.loop.excitation import Excitation
 from magtensor.loop.found import Search, Step
 from magtensor.loop.latent import NAME, Sought, renewed, sought, tried_source
@@ -66,7 +67,8 @@ def search(
     standing = trial(record, first, how)
     steps: list[Step] = []
     failed: dict[str, str] = {}
-    for _ in range(most_effects + 1):
+    asked = False  # whether something simpler does as well
+    for _ in range(most_effects + 2):
         state = with_lines(state, record, lines)
         if len(state.adopted) - len(declared) >= most_effects or state.residual.square() < ROUNDING:
             break
@@ -76,6 +78,16 @@ def search(
         if adopted.standing is not None:
             record, state = renewed(record, adopted.standing.state, how)
             standing = replace(adopted.standing, state=state)
+            continue
+        exchanged = None if asked else _exchanged(record, state, steps, how, len(declared), len(testable))
+        asked = True
+        if exchanged is not None:
+            after, step = exchanged
+            if say is not None and step.adopted is not None:
+                say(f"{step.adopted.model.name} takes the place of {', '.join(step.refused)}")
+            steps[-1] = step
+            record, state = renewed(record, after.state, how)
+            standing = replace(after, state=state)
             continue
         shared = sought(state, record)
         if shared is None or hidden is None or NAME in {a.name for a in state.adopted}:
@@ -94,7 +106,8 @@ def search(
         name, why = doubted
         if say is not None:
             say(f"taking {name} out again")
-        record, state = renewed(record, _without(found, name, len(declared), how), how)
+        places = [i for i, a in enumerate(found.last.adopted) if a.name == name and i >= len(declared)]
+        record, state = renewed(record, without_models(record, found.last, places, how), how)
         state = with_lines(state, record, lines)
         candidates = candidates_of(state, open_models(testable, state), failed, alpha)
         steps.append(Step(state, tuple(candidates), None, refused={name: why}))
@@ -103,16 +116,29 @@ def search(
     return found
 
 
+def _exchanged(
+    record: Record, state: State, steps: Sequence[Step], how: Fitting, fixed: int, models: int
+) -> tuple[Trial, Step] | None:
+    """The fit with a simpler model in the place of an adopted one that it does as well as, and the round's story."""
+    found = simpler(state, steps, fixed)
+    if found is None:
+        return None
+    place, other = found
+    old = state.adopted[place].name
+    without = without_models(record, state, [place], how)
+    chosen = looked_at_again(without, other, models)
+    if chosen is None:
+        return None
+    after, _ = _kept(record, trial(record, without, how), chosen, how)
+    if after is None:
+        return None
+    why = f"{chosen.model.name}, which has fewer coefficients, does as well beside the others"
+    return after, Step(without, (chosen,), chosen, (old,), refused={old: why})
+
+
 def _settled(record: Record, state: State, how: Fitting) -> State:
     """The fit at the end: what nothing explains is a disturbance after all, and no part of the calibration."""
     return joint_state(record, state.adopted, replace(how, searching=False), state.theta, state.lines)
-
-
-def _without(found: Search, name: str, fixed: int, how: Fitting) -> State:
-    """The fit without the models of a name, but for the first ones."""
-    last = found.last
-    kept = [i for i, a in enumerate(last.adopted) if i < fixed or a.name != name]
-    return joint_state(found.record, [last.adopted[i] for i in kept], how, [last.theta[i] for i in kept], last.lines)
 
 
 @dataclass(frozen=True)
