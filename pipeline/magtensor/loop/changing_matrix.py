@@ -22,6 +22,7 @@ from magtensor.loop.residual import Residual
 from magtensor.loop.separation import SEPARATION
 from magtensor.loop.statistics import Gain, interleaved_gain
 from magtensor.loop.terms import Terms, joined
+from magtensor.sharing import shared_out
 
 COSINES = 4  # over the survey: slower than any block is long
 BLOCKS = 40  # longer than what noise can be expected to remember beyond its fitted colour
@@ -122,9 +123,8 @@ def _strongest(
     """The sensor, with the waveform, that explains most of what the given terms leave; None if none is significant."""
     held = joined(list(given)) if given else None
     white = Whitened.of(residual, colours.across, colours.along, held)
-    gains: dict[tuple[int, str], Gain] = {}
-    for number in range(len(x.sensors)):
-        gains |= {(number, name): gain for name, gain in _gains(white, x, number, waveforms).items()}
+    of_each = shared_out(lambda number: _gains(white, x, number, waveforms), range(len(x.sensors)))
+    gains = {(number, name): gain for number, own in enumerate(of_each) for name, gain in own.items()}
     each = alpha / len(gains)
     passing = {key: gain for key, gain in gains.items() if gain.t > _least_t(each, len(gain.before))}
     if not passing:
