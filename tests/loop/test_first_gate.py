@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from loop_cases import Array, linear_state, synthetic
+from scipy.special import chdtrc, chdtri
 
+from magtensor.loop.assessment import assess, estimated_in, explained, slow_noise_of
+from magtensor.loop.evidence import Whitened
 from magtensor.loop.outcome import why
 from magtensor.loop.screening import ALONE, ALPHA, UNLIKELY, Candidate, candidates_of
 from magtensor.loop.search import with_lines
 from magtensor.loop.statistics import Gain
+from magtensor.loop.terms import Terms
 from magtensor.registry import Registry
 
 MODELS = ("turn_step", "scale_drift", "nonlinearity_cubic", "eddy_current")
@@ -70,3 +75,43 @@ def test_a_weak_turn_that_twelve_blocks_cannot_prove_among_the_whole_catalogue()
     among_all = replace(found, adjusted_p=found.adjusted_p * more, adjusted_null_p=found.adjusted_null_p * more)
     assert among_all.adjusted_p > ALPHA and among_all.passes
     assert found.model.settings["time_s"] == pytest.approx(700.0, abs=60.0)
+
+
+@pytest.mark.parametrize(("walking", "low", "high"), [((0,), 2.5, 3.2), ((0, 1, 2, 3), 0.5, 1.6), ((), 0.7, 1.4)])
+def test_one_sensor_with_more_slow_noise_than_the_others(walking: Sequence[int], low: float, high: float) -> None:
+    """Of noise in one of four sensors the contrasts hold 9/16 there and 1/16 in each other one: 3 times the average."""
+    rng = np.random.default_rng(11)
+    added = np.zeros((1200, 4, 3))
+    for number in walking:
+        walk = np.cumsum(rng.standard_normal((1200, 3)), axis=0)
+        added[:, number] = 2.0 * walk / walk.std(axis=0)
+
+    state = linear_state(synthetic(12, noise_nT=0.3, added=added))
+
+    assert low < slow_noise_of(0, state.residual, state.colours.across) < high
+    assert slow_noise_of(None, state.residual, state.colours.across) == 1.0
+
+
+def test_what_is_all_in_a_noisy_sensor_is_judged_in_its_own_noise() -> None:
+    """The chi-square of a step in the sensor that walks is divided by the three above; in a quiet one by about one."""
+    walk = np.cumsum(np.random.default_rng(13).standard_normal((1200, 3)), axis=0)
+    offset_step = Registry.load().find("error_model", "offset_step")
+    in_average_noise, in_own_noise = [], []
+    for sensor in (0, 2):
+        added = np.zeros((1200, 4, 3))
+        added[:, 0] = walk / walk.std(axis=0)
+        added[700:, sensor] += [3.0, -2.0, 4.0]
+        state = linear_state(synthetic(14, noise_nT=0.3, added=added))
+        terms = offset_step.function(state.excitation, time_s=699.5).at(state.residual.samples)
+        terms = terms.only(range(3 * sensor, 3 * sensor + 3))
+        white = Whitened.of(state.residual, state.colours.across, state.colours.along)
+        in_average_noise.append(float(chdtri(3, estimate_p(white, terms))))
+        in_own_noise.append(float(chdtri(3, assess(white, terms).null_p)))
+    assert 2.0 < in_average_noise[0] / in_own_noise[0] < 3.5
+    assert in_average_noise[1] / in_own_noise[1] < 1.5
+
+
+def estimate_p(white: Whitened, terms: Terms) -> float:
+    """P value of the terms in noise of the average colour."""
+    estimate = estimated_in(white, terms)
+    return float(chdtrc(estimate.rank, explained(estimate)))

@@ -11,12 +11,15 @@ from magtensor.calibration.types import Array
 from magtensor.loop.colour import Colour, colour_of
 from magtensor.loop.evidence import Grams, Whitened, grams, grams_in, normal
 from magtensor.loop.residual import Residual, taken_off
-from magtensor.loop.statistics import Estimate, Gain, family_p, held_out_gain, own_information, solve
+from magtensor.loop.statistics import Estimate, Gain, family_p, focused_gain, held_out_gain, own_information, solve
 from magtensor.loop.terms import Terms, joined
 from magtensor.loop.turned import TurnedColour, excess_of, excess_of_one
 
 FINEST_BLOCKS = 120
 LEAST_PER_BLOCK = 4
+NEARLY_ALL = 0.9  # of what is explained: the average colour of the sensors' noise then has to suit one of them
+SLOWEST = 20  # part of the frequencies that count as slow
+LEAST_SLOWEST = 30
 _ROUNDS = 3  # the colour depends on the coefficients and they on it; after three nothing moves
 
 
@@ -62,8 +65,11 @@ class Assessment:
         estimate: coefficients, covariance (in noise of the fitted colour), information.
         gain: on held-out blocks, in noise whose colour is found when the terms have explained their part.
         null_gain: the same in noise whose colour is found without them: what the null hypothesis says of the noise.
+        focused, null_focused: both again on folds that know equally much of the terms, which are short where these act;
+            None where a few blocks know nearly all.
         p: that all coefficients are zero, from the scatter over blocks.
-        null_p: the same from what they explain in noise of the colour that the residual has without them.
+        null_p: the same from what they explain in noise of the colour that the residual has without them, stronger
+            where it is all in one sensor with more slow noise than the others.
         colours: under the hypothesis that the terms are real.
         theta: the likeliest coefficients, with any colour: where a joint fit begins.
     """
@@ -71,6 +77,8 @@ class Assessment:
     estimate: Estimate
     gain: Gain
     null_gain: Gain
+    focused: Gain | None
+    null_focused: Gain | None
     p: float
     null_p: float
     colours: Colours
@@ -102,13 +110,16 @@ def assess(now: Whitened, terms: Terms) -> Assessment:
     count = block_count(len(residual.affine))
     null = grams_in(now, terms, count)
     null_gain = held_out_gain(null, residual.freedom, blocked)
-    null_p = _p_of(null, first)
+    null_focused = focused_gain(null, residual.freedom, blocked)
     best = likeliest(residual, together, [Colours(now.across, now.along), WHITE], _estimate(null).theta)
     colours = best.colours
+    stronger = slow_noise_of(_only_sensor(null, first, terms), taken_off(residual, together, best.theta), now.across)
+    null_p = _p_of(null, first, max(stronger, 1.0))
     blocks = grams(residual, together, colours.across, colours.along, count)
     p = family_p(blocks, together.sensors, own)
     gain = held_out_gain(blocks, residual.freedom, blocked)
-    return Assessment(_estimate(blocks), gain, null_gain, p, null_p, colours, best.theta)
+    focused = focused_gain(blocks, residual.freedom, blocked)
+    return Assessment(_estimate(blocks), gain, null_gain, focused, null_focused, p, null_p, colours, best.theta)
 
 
 @dataclass(frozen=True)
@@ -145,14 +156,41 @@ def likeliest(residual: Residual, terms: Terms, guesses: Sequence[Colours], firs
     return max(found, key=lambda each: each.log_likelihood)
 
 
-def _p_of(blocks: Grams, given: int) -> float:
-    """P value of all terms but the first ones, from what they explain in white noise of unit variance."""
+def _p_of(blocks: Grams, given: int, variance: float) -> float:
+    """P value of all terms but the first ones, from what they explain in white noise of a variance."""
     from scipy.special import chdtrc
 
     n, y = normal(blocks.total())
     scale = own_information(blocks)
     every, without = solve(n[0], y[0], scale), solve(n[0, :given, :given], y[0, :given], scale[:given])
-    return float(chdtrc(max(every.rank - without.rank, 1), max(explained(every) - explained(without), 0.0)))
+    gained = max(explained(every) - explained(without), 0.0) / variance
+    return float(chdtrc(max(every.rank - without.rank, 1), gained))
+
+
+def _only_sensor(blocks: Grams, given: int, terms: Terms) -> int | None:
+    """The number of the sensor whose coefficients hold nearly all that terms beside the given ones explain."""
+    n, y = normal(blocks.total())
+    theta, own = solve(n[0], y[0], own_information(blocks)).theta[given:], n[0, given:, given:]
+    held: dict[int, float] = {}
+    for sensor in set(terms.part_output // 3):
+        each = sorted(set(terms.part_term[terms.part_output // 3 == sensor]))
+        held[int(sensor)] = float(theta[each] @ own[np.ix_(each, each)] @ theta[each])
+    most = max(held, key=lambda s: held[s])
+    return most if "" not in terms.sensors and held[most] > NEARLY_ALL * sum(held.values()) else None
+
+
+def slow_noise_of(sensor: int | None, left: Residual, across: Colour) -> float:
+    """Power of the slow noise that one sensor is left with, over that of all on average; 1 for none or the only one."""
+    if left.across is None or sensor is None:
+        return 1.0
+    from scipy.fft import dct
+
+    slow = max(len(left.across) // SLOWEST, LEAST_SLOWEST)
+    spectrum = dct(left.across, axis=0, norm="ortho")[1:slow]
+    if across.power is not None:
+        spectrum /= np.sqrt(across.power[1:slow, None])
+    power = np.mean(spectrum**2, axis=0).reshape(-1, 3).mean(axis=1)
+    return float(power[sensor] / power.mean())
 
 
 def log_likelihood(residual: Residual, colours: Colours) -> float:

@@ -162,7 +162,8 @@ def tried_source(
         return replace(found, objection="its waveform follows the direction of the field"), None
     model = Adopted(component, {"noise_nT": [float(v) for v in after.residual.noise]})
     after = replace(after, adopted=(*after.adopted[:-1], model))
-    evidence = Assessment(estimate, found.gain, found.gain, found.p, found.p, state.colours, estimate.theta)
+    gain = found.gain
+    evidence = Assessment(estimate, gain, gain, None, None, found.p, found.p, state.colours, estimate.theta)
     return found, Source(record, after, Candidate(model, 1, terms, evidence, found.p, found.p, ALPHA))
 
 

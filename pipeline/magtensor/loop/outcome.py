@@ -47,13 +47,14 @@ def _step(number: int, step: Step) -> dict[str, Any]:
 
 def judgement(candidate: Candidate) -> dict[str, Any]:
     """What was found of one error model, and whether the first two gates let it pass."""
-    gain = candidate.assessment.gain
+    gain, focused = candidate.assessment.gain, candidate.assessment.focused
     return {
         "error_model": candidate.model.name,
         "settings": {k: _plain(v) for k, v in candidate.model.settings.items()},
         "p": candidate.adjusted_p,
         "held_out_gain": float(gain.total),
         "t": float(gain.t),
+        "t_where_it_acts": None if focused is None else float(focused.t),
         "passes": bool(candidate.passes),
         "why": why(candidate, None),
     }

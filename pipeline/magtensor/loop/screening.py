@@ -106,7 +106,21 @@ class Candidate:
             return False
         gain = self.assessment.gain
         reduction = gain.total / max(float(gain.before.sum()), 1e-300)
-        return self.significant and gain.consistent and reduction > LEAST_REDUCTION
+        return self.significant and (gain.consistent or self.predicts_where_it_acts) and reduction > LEAST_REDUCTION
+
+    @property
+    def predicts_where_it_acts(self) -> bool:
+        """Whether a model that acts in a part of the survey only predicts one part of that from the others.
+
+        Then the folds of equal length are but one or two figures, which may gain much and tell no scatter. The short
+        folds in which it acts are not asked unless both the scatter over blocks and noise of the residual's own colour
+        are out of the question, and in noise of that colour it has to predict them as well.
+        """
+        focused, null = self.assessment.focused, self.assessment.null_focused
+        if focused is None or null is None or self.assessment.gain.total <= 0:
+            return False
+        unlikely = self.adjusted_p < self.alpha and self.adjusted_null_p < UNLIKELY * self.alpha
+        return unlikely and focused.consistent and null.total > 0
 
     @property
     def passes(self) -> bool:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -236,7 +236,7 @@ class Gain:
 
 
 def held_out_gain(g: Grams, freedom: int, blocked: NDArray[np.bool_] | None = None) -> Gain:
-    """Gain over contiguous folds, a block's gap between training and test.
+    """Gain over contiguous folds of equal length, a block's gap between training and test.
 
     Parameters
     ----------
@@ -245,8 +245,43 @@ def held_out_gain(g: Grams, freedom: int, blocked: NDArray[np.bool_] | None = No
     blocked: (P,) terms that belong to both models compared.
     """
     count = len(g.zz)
-    folds = min(FOLDS, count)
-    edges = np.linspace(0, count, folds + 1).round().astype(int)
+    return _gain_between(g, freedom, np.linspace(0, count, min(FOLDS, count) + 1).round().astype(int), blocked)
+
+
+def focused_gain(g: Grams, freedom: int, blocked: NDArray[np.bool_]) -> Gain | None:
+    """The same over contiguous folds that know equally much of the terms; None where a few blocks know nearly all.
+
+    What acts in one part of a survey only lies in one fold of equal length, and what the others predict of it is one
+    figure. Which fold is how long follows from the terms and not from the data.
+    """
+    known = np.cumsum(_share_of_blocks(g, ~blocked))
+    edges = np.unique(np.searchsorted(known, np.linspace(0.0, 1.0, FOLDS + 1)[1:-1], side="left") + 1)
+    edges = np.concatenate([[0], edges[edges < len(g.zz)], [len(g.zz)]])
+    if len(edges) <= LEAST_BLOCKS:
+        return None
+    gain = _gain_between(g, freedom, edges, blocked)
+    return replace(gain, values=np.full(len(gain.values), gain.values.mean()))  # each fold should gain as much
+
+
+def _share_of_blocks(g: Grams, chosen: NDArray[np.bool_]) -> Array:
+    """(B,) how much of what is known of some terms (P,) each block knows, constants left out; the sum is 1."""
+    info = np.diagonal(g.aa, axis1=1, axis2=2)[:, g.own :].copy()
+    raw = g.part_output >= 0
+    if raw.any() and g.zz.any():
+        own, mixed = g.zz[:, 3, 3], g.zd[:, 3]
+        mean = mixed.sum(axis=0) / own.sum()
+        size = np.diagonal(g.dd, axis1=1, axis2=2) - 2.0 * mean * mixed + mean**2 * own[:, None]
+        o = g.part_output[raw]
+        each = size[:, g.part_series[raw]] * g.projector[o, o] / g.noise[o] ** 2
+        np.add.at(info.T, g.part_term[raw], each.T)
+    info = np.maximum(info[:, chosen], 0.0)
+    out: Array = (info / np.maximum(info.sum(axis=0), 1e-300)).mean(axis=1)
+    return out
+
+
+def _gain_between(g: Grams, freedom: int, edges: NDArray[np.int_], blocked: NDArray[np.bool_] | None = None) -> Gain:
+    """Gain over folds of the finest blocks between edges."""
+    count, folds = len(g.zz), len(edges) - 1
     test_masks, train_masks = np.zeros((folds, count), dtype=bool), np.ones((folds, count), dtype=bool)
     gap = 1 if count >= 4 * folds else 0
     for k, (a, b) in enumerate(itertools.pairwise(edges)):
