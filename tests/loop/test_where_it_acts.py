@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 from loop_cases import Array, linear_state, synthetic
 
-from magtensor.loop.screening import ALPHA, Candidate, candidates_of
+from magtensor.loop.outcome import why
+from magtensor.loop.screening import ALPHA, SECOND_ORDER, Candidate, candidates_of
 from magtensor.loop.statistics import LEAST_T
 from magtensor.registry import Registry
 
@@ -57,3 +58,14 @@ def test_folds_that_know_equally_much_do_not_follow_the_data() -> None:
     folds = [one.assessment.null_focused for one in found]
     assert len({None if one is None else len(one.before) for one in folds}) == 1
     assert not any(one.passes for one in found[:1])
+
+
+def test_the_next_order_of_something_strong_is_no_effect() -> None:
+    rng = np.random.default_rng(16)
+    found = looked_at(17, pump(rng), 0.5 * pump(np.random.default_rng(16))[:, None, None] * rng.standard_normal((4, 3)))
+    assert found.passes and not found.of_second_order
+
+    beside = replace(found, beside=1.01 * found.assessment.gain.total / SECOND_ORDER)
+
+    assert beside.of_second_order and not beside.passes
+    assert "next order" in why(beside, None)

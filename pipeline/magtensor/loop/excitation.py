@@ -17,6 +17,7 @@ from magtensor.loop.held_logs import unheld
 from magtensor.loop.terms import REFERENCE, Terms
 
 AXES = "xyz"
+LONG_LAG = 20.0  # samples: of white noise a sixth is left behind it
 VECTORS = ("acceleration", "angular_rate")  # channels with a value for each axis whatever the number of sensors
 
 
@@ -108,7 +109,8 @@ class Excitation:
 
     def thermometer(self, name: str, lag_s: float = 0.0) -> Array:
         """A logged temperature without the noise of its log, seen through a lag: what has a thermal mass does not jump,
-        neither between samples nor where a log that is written seldom has a new value."""
+        neither between samples nor where a log that is written seldom has a new value. A lag of many samples takes off
+        the white noise itself, and nothing of what happened at once, such as switching on."""
         return self._course(name, lag_s, smooth=True)
 
     def _course(self, name: str, lag_s: float, smooth: bool) -> Array:
@@ -117,13 +119,12 @@ class Excitation:
             return whole._course(name, lag_s, smooth)[samples]
         key = name, lag_s, smooth
         if key not in self._courses:
-            if lag_s:
-                found = self.lagged(self._course(name, 0.0, smooth), lag_s)
-            else:
-                values = self.channel(name)
-                columns = [unheld(self.time, c) if smooth else c for c in values.reshape(len(values), -1).T]
-                found = np.column_stack(columns).reshape(values.shape)
-            self._courses[key] = found
+            values = self.channel(name)
+            if smooth:
+                quiet = lag_s < LONG_LAG * self.spacing
+                columns = [unheld(self.time, c, quiet=quiet) for c in values.reshape(len(values), -1).T]
+                values = np.column_stack(columns).reshape(values.shape)
+            self._courses[key] = self.lagged(values, lag_s) if lag_s else values
         return self._courses[key]
 
     def is_vector(self, name: str) -> bool:

@@ -26,7 +26,7 @@ from magtensor.loop.likeness import effect_along, followed
 from magtensor.loop.log_noise import brought_in
 from magtensor.loop.model import Adopted, Fitting, Record, State, excitation_of, joint_state, without
 from magtensor.loop.residual import Residual
-from magtensor.loop.screening import LOG_MARGIN, Candidate
+from magtensor.loop.screening import LOG_MARGIN, SECOND_ORDER, Candidate, explained_before
 from magtensor.loop.statistics import FOLDS, Gain
 from magtensor.loop.terms import joined
 from magtensor.loop.waveform import NAME, Course, course_of, free_directions
@@ -105,6 +105,8 @@ def sought(state: State, record: Record) -> Sought | None:
     objection = ""
     if not told:
         objection = "with two sensors it cannot be told from a disturbance of one of them"
+    elif n * float(seen @ seen) <= SECOND_ORDER * explained_before(state):
+        objection = "it is less than 0.3 % of what is adopted, whose next order may leave it"
     elif not gain.consistent:
         objection = "the sensors do not predict each other with it on held-out stretches"
     elif like is not None:

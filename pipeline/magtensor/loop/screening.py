@@ -24,7 +24,7 @@ from magtensor.loop.excitation import Excitation
 from magtensor.loop.log_noise import brought_in
 from magtensor.loop.model import Adopted, State, regressors
 from magtensor.loop.multiplicity import alike, effective_tests, projected
-from magtensor.loop.residual import Residual
+from magtensor.loop.residual import Residual, taken_off
 from magtensor.loop.scoring import Scorer
 from magtensor.loop.separation import SEPARATION, Assessed, lower_orders, lowest
 from magtensor.loop.settings import EventTimes, Range
@@ -35,6 +35,7 @@ ALPHA = 0.005  # family-wise probability that a clean survey gets an adoption, b
 ALONE = 1e-3  # probability that a single test by blocks is passed, which bears noise's own colour out
 AMONG_ITS_SETTINGS = 0.05  # the same, that the test with the best of a model's settings is
 UNLIKELY = 0.02  # of the family-wise probability: asked for in noise of the residual's own colour
+SECOND_ORDER = 1e-5  # of the sum of squares that is explained: 0.3 % of an effect's size
 LEAST_REDUCTION = 1e-4  # of the held-out sum of squares: smaller is significant only in very long surveys
 LOG_MARGIN = 1.5  # the noise of a log is known to some per cent, and a dozen coefficients gain a little by chance
 SCREENED = 8  # models looked at closely in each round
@@ -60,6 +61,7 @@ class Candidate:
         adjusted_null_p: the same for what it explains in noise of the residual's own colour.
         alpha: what the adjusted p has to stay below.
         log_noise: what noise in the log of its channel, brought in by a model adopted before, lets it gain.
+        beside: sum of squares that the models adopted before explain.
     """
 
     model: Adopted
@@ -70,11 +72,21 @@ class Candidate:
     adjusted_null_p: float
     alpha: float = ALPHA
     log_noise: float = 0.0
+    beside: float = 0.0
 
     @property
     def of_the_log(self) -> bool:
         """Whether noise in the log of a channel explains what it gains."""
         return 0.0 < self.assessment.gain.total <= LOG_MARGIN * self.log_noise
+
+    @property
+    def of_second_order(self) -> bool:
+        """Whether it is so small beside what is adopted that the next order of that explains as much.
+
+        Every effect is described to first order, with logs that err: an attitude by a tenth of a degree is an error of
+        0.2 % of a gradient.
+        """
+        return 0.0 < self.assessment.gain.total <= SECOND_ORDER * self.beside
 
     @property
     def significant(self) -> bool:
@@ -102,7 +114,7 @@ class Candidate:
     @property
     def predicts(self) -> bool:
         """Whether it is significant and predicts held-out blocks, in noise of the colour of what it leaves."""
-        if self.of_the_log:
+        if self.of_the_log or self.of_second_order:
             return False
         gain = self.assessment.gain
         reduction = gain.total / max(float(gain.before.sum()), 1e-300)
@@ -175,8 +187,9 @@ def candidates_of(state: State, models: Sequence[Component], failed: dict[str, s
     found = _one_each(state, assessed)
     adjusted = _holm([a.p * tried for _, tried, _, a in found], len(names))
     null = _holm([a.null_p * tried for _, tried, _, a in found], len(names))
+    beside = explained_before(state)
     candidates = [
-        Candidate(model, tried, terms, assessment, p, null_p, alpha, _log_noise(state, model))
+        Candidate(model, tried, terms, assessment, p, null_p, alpha, _log_noise(state, model), beside)
         for (model, tried, terms, assessment), p, null_p in zip(found, adjusted, null, strict=True)
     ]
     return sorted(candidates, key=lambda c: -c.assessment.gain.total)
@@ -350,6 +363,15 @@ def _one_each(state: State, assessed: Sequence[Assessed]) -> list[Assessed]:
     for each in assessed:
         named.setdefault(each[0].name, []).append(each)
     return [lowest(state, several, profiled(several[0][0].component)) for several in named.values()]
+
+
+def explained_before(state: State) -> float:
+    """Sum of squares of the whitened residual that the adopted models explain together."""
+    if state.terms is None:
+        return 0.0
+    residual = state.residual
+    back = taken_off(residual, state.terms, -np.concatenate(state.theta))
+    return max(back.square() - residual.square(), 0.0) * len(residual.affine) * residual.freedom
 
 
 def _log_noise(state: State, model: Adopted) -> float:
