@@ -126,8 +126,13 @@ class Candidate:
 
         Then the folds of equal length are but one or two figures, which may gain much and tell no scatter. The short
         folds in which it acts are not asked unless both the scatter over blocks and noise of the residual's own colour
-        are out of the question, and in noise of that colour it has to predict them as well.
+        are out of the question, and in noise of that colour it has to predict them as well. Only of what follows a
+        channel: a drift is everywhere, and short folds at its end say no more than that neighbours are alike.
         """
+        from magtensor.loop.settings import AnyChannel
+
+        if not any(isinstance(grid, AnyChannel) for grid in profiled(self.model.component).values()):
+            return False
         focused, null = self.assessment.focused, self.assessment.null_focused
         if focused is None or null is None or self.assessment.gain.total <= 0:
             return False
