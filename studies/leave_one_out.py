@@ -30,7 +30,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 import trials
-from loop_power import Trial, models, simulated, trial_of
+from loop_power import Trial, models, simulated
 from loop_surveys import EFFECTS, recorded
 
 from magtensor.errors import MagtensorError
@@ -163,7 +163,7 @@ def main() -> None:
         for amplitude in chosen.amplitudes.split(",")
         for effect in chosen.effects.split(",")
     ]
-    rows, _ = trials.rows_of(chosen, planned, trial_of, tried, line)
+    rows, _ = trials.rows_of(chosen, planned, trials.named(Trial), tried, line)
     if chosen.page:
         chosen.page.write_text(page(rows))
 

@@ -144,11 +144,11 @@ def outcome(flight: Flight) -> dict[str, Any]:
     """What the loop makes of it."""
     from magtensor.calibration.nominal import Nominal
     from magtensor.errors import MagtensorError
+    from magtensor.loop.gates import ALPHA
     from magtensor.loop.inquiry import Inquiry
     from magtensor.loop.model import Fitting
     from magtensor.loop.near_nominal import settled
     from magtensor.loop.outcome import described
-    from magtensor.loop.screening import ALPHA
     from magtensor.loop.search import MOST_EFFECTS
     from magtensor.loop.unexplained import unexplained
     from magtensor.registry import Registry

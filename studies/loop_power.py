@@ -92,11 +92,6 @@ class Trial(NamedTuple):
     rate_Hz: float
 
 
-def trial_of(row: dict[str, Any]) -> Trial:
-    """The trial that a row is of."""
-    return Trial(*(row[key] for key in Trial._fields))
-
-
 @cache
 def models() -> dict[str, Component]:
     """Every error model by name."""
@@ -240,7 +235,7 @@ def main() -> None:
     parser.add_argument("--noises", default="white and 1/f", help=f"of the surveys with effects: {', '.join(NOISES)}")
     parser.add_argument("--rate", type=float, default=BASE["rate_Hz"], help="Hz")
     chosen = parser.parse_args()
-    rows, open_ = trials.rows_of(chosen, planned(chosen), trial_of, tried, loop_power_page.line)
+    rows, open_ = trials.rows_of(chosen, planned(chosen), trials.named(Trial), tried, loop_power_page.line)
     if chosen.page:
         command = f"python studies/loop_power.py {' '.join(repr(a) if ' ' in a else a for a in sys.argv[1:])}"
         chosen.page.write_text(loop_power_page.page(__doc__ or "", command, rows, open_))

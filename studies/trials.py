@@ -61,6 +61,11 @@ def rows_of(
     return rows, open_
 
 
+def named(kind: Any) -> Callable[[Row], Any]:
+    """Reads a trial, a named tuple of that kind, out of a row that holds its fields among others."""
+    return lambda row: kind(*(row[field] for field in kind._fields))
+
+
 def _in_time(tried: Callable[[Any], Row], end: float, trial: Any) -> Row | None:
     """The row of a trial; None when the time is over."""
     return tried(trial) if time.time() < end else None

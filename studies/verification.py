@@ -55,11 +55,6 @@ class Trial(NamedTuple):
     seed: int
 
 
-def trial_of(row: dict[str, Any]) -> Trial:
-    """The trial that a row is of."""
-    return Trial(*(row[key] for key in Trial._fields))
-
-
 def written(trial: Trial, folder: Path) -> tuple[Path, Path]:
     """Both surveys as files."""
     first = scenario(trial.motion, NOISES[NOISE], trial.seed, trial.effect, trial.amplitude)
@@ -155,7 +150,7 @@ def main() -> None:
     parser.add_argument("--motions", default="tumbling,tilt 40")
     parser.add_argument("--seed", type=int, default=5000)
     chosen = parser.parse_args()
-    rows, open_ = trials.rows_of(chosen, planned(chosen), trial_of, tried, line)
+    rows, open_ = trials.rows_of(chosen, planned(chosen), trials.named(Trial), tried, line)
     if chosen.page:
         command = f"python studies/verification.py {' '.join(repr(a) if ' ' in a else a for a in sys.argv[1:])}"
         chosen.page.write_text(page(command, rows, open_))

@@ -350,7 +350,7 @@ def with_decisions(document: Document, decisions: Sequence[str], models: Sequenc
 
 def _try(model: Any, inquiry: Inquiry) -> None:
     """See that a model makes regressors here: one that does not would spoil the ranking of all."""
-    from magtensor.loop.screening import settings_grid
+    from magtensor.loop.profiling import settings_grid
 
     x = inquiry.first.excitation
     try:

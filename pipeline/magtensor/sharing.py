@@ -11,6 +11,8 @@ import signal
 from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
+from magtensor.errors import UsageError
+
 PROCESSES = "MAGTENSOR_PROCESSES"  # of the environment; one process where it is not set
 
 Item = TypeVar("Item")
@@ -26,11 +28,15 @@ def cores() -> int:
 
 
 def shared_out(work: Callable[[Item], Found], items: Sequence[Item]) -> list[Found]:
-    """What a function finds of each item, in their order; it may change nothing that others are to see.
+    """What a function finds of each item, in their order.
 
     Parameters
     ----------
-    work: any function, of which the items, and what it finds, can be pickled.
+    work: any function, of any items; what it finds must survive pickling, and what it changes nobody sees.
+
+    Raises
+    ------
+    UsageError: the variable of the environment is no number of processes.
     """
     global _shared
     processes = min(_wanted(), len(items))
@@ -49,7 +55,9 @@ def shared_out(work: Callable[[Item], Found], items: Sequence[Item]) -> list[Fou
 
 def _wanted() -> int:
     wanted = os.environ.get(PROCESSES, "1")
-    return int(wanted) if wanted.isdigit() else 1
+    if not (wanted.isascii() and wanted.isdigit() and int(wanted) > 0):
+        raise UsageError(f"{PROCESSES}={wanted}: a whole number of processes from 1 on would be right")
+    return int(wanted)
 
 
 def _begin() -> None:

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from magtensor.errors import DataError
+from magtensor.errors import DataError, UsageError
 from magtensor.sharing import PROCESSES, shared_out
 
 
@@ -51,3 +51,11 @@ def test_an_error_comes_back_as_it_was_raised(two: None) -> None:
 
     assert (caught.value.where, caught.value.hint) == ("survey.h5", "more would do")
     assert shared_out(lambda k: k, range(3)) == [0, 1, 2]  # and the next work is not in its way
+
+
+@pytest.mark.parametrize("wanted", ["0", "two", "-1", ""])
+def test_a_number_of_processes_that_is_none_is_refused(wanted: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(PROCESSES, wanted)
+
+    with pytest.raises(UsageError, match=f"{PROCESSES}={wanted}: a whole number"):
+        shared_out(lambda k: k, range(3))

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from magtensor.loop.model import Fitting, Record, State, joint_state
 from magtensor.loop.record import record_of
-from magtensor.loop.screening import profiled
-from magtensor.loop.settings import EventTimes
+from magtensor.loop.settings import EventTimes, profiled
 from magtensor.preparing import empty_survey, load_as
 from magtensor.recipe.plan import read_plan
 from magtensor.registry import Registry

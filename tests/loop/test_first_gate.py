@@ -12,8 +12,9 @@ from scipy.special import chdtrc, chdtri
 
 from magtensor.loop.assessment import assess, estimated_in, explained, slow_noise_of
 from magtensor.loop.evidence import Whitened
+from magtensor.loop.gates import ALONE, ALPHA, UNLIKELY, Candidate
 from magtensor.loop.outcome import why
-from magtensor.loop.screening import ALONE, ALPHA, UNLIKELY, Candidate, candidates_of
+from magtensor.loop.screening import candidates_of
 from magtensor.loop.search import with_lines
 from magtensor.loop.statistics import Gain
 from magtensor.loop.terms import Terms

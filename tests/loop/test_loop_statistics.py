@@ -12,10 +12,10 @@ from scipy.stats import kstest
 from magtensor.loop.assessment import block_count, colours_of
 from magtensor.loop.colour import Colour, colour_of
 from magtensor.loop.evidence import grams
+from magtensor.loop.gates import ALPHA
 from magtensor.loop.model import Record, State
 from magtensor.loop.quiet import quieted
 from magtensor.loop.record import CLEARANCE
-from magtensor.loop.screening import ALPHA
 from magtensor.loop.spectrum import spectral_lines
 from magtensor.loop.statistics import Gain, cauchy_combination, family_p, wald_p
 

@@ -7,8 +7,9 @@ from dataclasses import replace
 import numpy as np
 from loop_cases import Array, linear_state, synthetic
 
+from magtensor.loop.gates import ALPHA, SECOND_ORDER, Candidate
 from magtensor.loop.outcome import why
-from magtensor.loop.screening import ALPHA, SECOND_ORDER, Candidate, candidates_of
+from magtensor.loop.screening import candidates_of
 from magtensor.loop.statistics import LEAST_T
 from magtensor.registry import Registry
 

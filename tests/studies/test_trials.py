@@ -41,9 +41,7 @@ def run(folder: Path, wanted: list[Trial], seconds: float = math.inf) -> tuple[l
     os.environ["TRIALS_MADE"] = str(made)
     chosen = argparse.Namespace(rows=folder / "deeper/rows.jsonl", seconds=seconds, workers=1)
     try:
-        rows, open_ = trials.rows_of(
-            chosen, wanted, lambda row: (row["name"], row["seed"]), tried, lambda row: str(row["square"])
-        )
+        rows, open_ = trials.rows_of(chosen, wanted, trials.named(Trial), tried, lambda row: str(row["square"]))
     finally:
         del os.environ["TRIALS_MADE"]
     return rows, open_, made.read_text().split()
@@ -74,7 +72,7 @@ def test_what_was_made_before_a_bug_is_kept(tmp_path: Path) -> None:
     assert [r["name"] for r in stored(tmp_path)] == ["a"]
 
 
-@pytest.mark.parametrize("study", ["loop_power", "leave_one_out", "level_flight"])
+@pytest.mark.parametrize("study", ["loop_power", "leave_one_out", "level_flight", "verification"])
 def test_a_row_names_its_trial(study: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """A study that is given the rows of all its trials makes none of them again."""
     module = __import__(study)

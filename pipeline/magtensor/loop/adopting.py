@@ -6,10 +6,11 @@ import numpy as np
 
 from magtensor.loop.assessment import estimated, explained
 from magtensor.loop.contribution import KEEP_ALPHA, put_back, significance, slices
+from magtensor.loop.gates import Candidate
 from magtensor.loop.model import Adopted, Fitting, Record, State, joint_state
+from magtensor.loop.profiling import golden
 from magtensor.loop.scoring import Scorer
-from magtensor.loop.screening import Candidate, golden, profiled
-from magtensor.loop.settings import Range
+from magtensor.loop.settings import Range, profiled
 
 POLISH = 0.1  # of a setting, to either side
 _SWEEPS = 6  # over all settings, where two models of one kind are in

@@ -13,12 +13,13 @@ from magtensor.loop.adopting import adopt
 from magtensor.loop.assessment import estimated
 from magtensor.loop.contribution import removal, without_models
 from magtensor.loop.found import Step
+from magtensor.loop.gates import Candidate
 from magtensor.loop.latent import NAME, renewed, sought, tried_source
 from magtensor.loop.model import Fitting, Record, State
 from magtensor.loop.outcome import why
-from magtensor.loop.screening import Candidate, candidates_of, profiled
+from magtensor.loop.screening import candidates_of
 from magtensor.loop.search import simplest
-from magtensor.loop.settings import AnyChannel
+from magtensor.loop.settings import AnyChannel, profiled
 from magtensor.loop.trial import trial
 
 ADOPTED = "{} is adopted already; reject it or undo first to adopt it otherwise"

@@ -12,8 +12,9 @@ from dataclasses import replace
 
 from magtensor.loop.contribution import put_back, slices
 from magtensor.loop.found import Step
+from magtensor.loop.gates import Candidate
 from magtensor.loop.model import State
-from magtensor.loop.screening import Candidate, candidates_of, generic
+from magtensor.loop.screening import candidates_of, generic
 from magtensor.loop.separation import fold_gain, separated
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from magtensor.loop.gates import Candidate
 from magtensor.loop.latent import Sought
 from magtensor.loop.model import Record, State
-from magtensor.loop.screening import Candidate
 
 
 @dataclass(frozen=True)

@@ -17,13 +17,15 @@ from magtensor.loop import by_hand
 from magtensor.loop.by_hand import ByHand
 from magtensor.loop.decisions import Decision
 from magtensor.loop.found import Search, Step
+from magtensor.loop.gates import Candidate
 from magtensor.loop.latent import NAME, sought
 from magtensor.loop.long_record import on_every_sample, part_of
 from magtensor.loop.model import Adopted, Fitting, Record, State, joint_state, without
 from magtensor.loop.needs import missing
 from magtensor.loop.outcome import described
+from magtensor.loop.profiling import repeatable
 from magtensor.loop.record import record_of
-from magtensor.loop.screening import Candidate, candidates_of, repeatable
+from magtensor.loop.screening import candidates_of
 from magtensor.loop.search import search, with_lines
 from magtensor.survey.model import Survey
 

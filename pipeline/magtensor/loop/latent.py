@@ -22,11 +22,11 @@ from magtensor.loop.assessment import Assessment, estimated
 from magtensor.loop.colour import beside_the_field
 from magtensor.loop.direction import attitude_series
 from magtensor.loop.factor import Factors, Groups, noise_alone, with_factor
+from magtensor.loop.gates import LOG_MARGIN, SECOND_ORDER, Candidate, explained_before
 from magtensor.loop.likeness import effect_along, followed
 from magtensor.loop.log_noise import brought_in
 from magtensor.loop.model import Adopted, Fitting, Record, State, excitation_of, joint_state, without
 from magtensor.loop.residual import Residual
-from magtensor.loop.screening import LOG_MARGIN, SECOND_ORDER, Candidate, explained_before
 from magtensor.loop.statistics import FOLDS, Gain
 from magtensor.loop.terms import joined
 from magtensor.loop.waveform import NAME, Course, course_of, free_directions

@@ -8,9 +8,9 @@ import numpy as np
 
 from magtensor.loop.contribution import removal
 from magtensor.loop.found import Search, Step
+from magtensor.loop.gates import Candidate
 from magtensor.loop.model import Adopted, Record
-from magtensor.loop.screening import Candidate, profiled
-from magtensor.loop.settings import Range
+from magtensor.loop.settings import Range, profiled
 from magtensor.loop.waveform import NAME
 
 

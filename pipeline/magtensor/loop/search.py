@@ -19,13 +19,15 @@ from magtensor.loop.contribution import eliminate, without_models
 from magtensor.loop.exchange import looked_at_again, simpler
 from magtensor.loop.excitation import Excitation
 from magtensor.loop.found import Search, Step
+from magtensor.loop.gates import ALPHA, Candidate
 from magtensor.loop.latent import NAME, Sought, renewed, sought, tried_source
 from magtensor.loop.model import Adopted, Fitting, Record, State, joint_state
 from magtensor.loop.needs import missing
 from magtensor.loop.overshadowed import overshadowed
-from magtensor.loop.screening import ALPHA, Candidate, candidates_of, generic, profiled, repeatable
+from magtensor.loop.profiling import repeatable
+from magtensor.loop.screening import candidates_of, generic
 from magtensor.loop.separation import SEPARATION, fold_gain, separated
-from magtensor.loop.settings import EventTimes
+from magtensor.loop.settings import EventTimes, profiled
 from magtensor.loop.spectrum import spectral_lines
 from magtensor.loop.trial import Trial, trial
 

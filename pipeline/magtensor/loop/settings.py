@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 if TYPE_CHECKING:
+    from magtensor.components import Component
     from magtensor.loop.excitation import Excitation
 
 
@@ -159,3 +160,13 @@ class Frequencies:
     def values(self, x: Excitation) -> list[Any]:
         """The candidates the residual's spectrum proposes."""
         return [float(f) for f in x.lines[: self.count]]
+
+
+def profiled(model: Component) -> dict[str, Any]:
+    """The settings of a model that are searched over, with their grids."""
+    found = {}
+    for name, parameter in model.parameters.items():
+        for mark in getattr(parameter.annotation, "__metadata__", ()):
+            if hasattr(mark, "values") and callable(mark.values):
+                found[name] = mark
+    return found

@@ -16,8 +16,7 @@ from magtensor.loop.correction import TONE, corrected_raw, corrected_reference
 from magtensor.loop.model import Adopted, Record
 from magtensor.loop.needs import FACTS
 from magtensor.loop.record import record_of
-from magtensor.loop.screening import profiled
-from magtensor.loop.settings import AnyChannel, Duration, EventTimes
+from magtensor.loop.settings import AnyChannel, Duration, EventTimes, profiled
 from magtensor.loop.waveform import NAME
 from magtensor.registry import Registry
 from magtensor.survey.model import Survey, Variable

@@ -16,11 +16,11 @@ from magtensor.loop.assessment import assess
 from magtensor.loop.changing_matrix import changing_matrices
 from magtensor.loop.flagged import beyond_the_reference, flagged_words, lasting
 from magtensor.loop.found import Search
+from magtensor.loop.gates import Candidate
 from magtensor.loop.gradient_shape import MODEL, gradient_share
 from magtensor.loop.latent import shared_words
 from magtensor.loop.model import Record, State
 from magtensor.loop.predictable import attitude_words
-from magtensor.loop.screening import Candidate
 from magtensor.loop.spectrum import spectral_lines
 
 ALPHA = 0.001  # of each of the tests

@@ -1,0 +1,125 @@
+"""The first two gates: what an error model has to show before anything is fitted anew."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from magtensor.loop.assessment import Assessment
+from magtensor.loop.model import Adopted, State
+from magtensor.loop.residual import taken_off
+from magtensor.loop.settings import AnyChannel, profiled
+from magtensor.loop.terms import Terms
+
+ALPHA = 0.005  # family-wise probability that a clean survey gets an adoption, before the second gate
+ALONE = 1e-3  # probability that a single test by blocks is passed, which bears noise's own colour out
+AMONG_ITS_SETTINGS = 0.05  # the same, that the test with the best of a model's settings is
+UNLIKELY = 0.02  # of the family-wise probability: asked for in noise of the residual's own colour
+SECOND_ORDER = 1e-5  # of the sum of squares that is explained: 0.3 % of an effect's size
+LEAST_REDUCTION = 1e-4  # of the held-out sum of squares: smaller is significant only in very long surveys
+LOG_MARGIN = 1.5  # the noise of a log is known to some per cent, and a dozen coefficients gain a little by chance
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """An error model with settings, looked at closely.
+
+    Attributes:
+        model: component and settings.
+        tried: independent tests that the settings tried for it amount to, for the correction of its p value.
+        terms: at the residual's samples.
+        assessment: of the terms, given the models adopted before.
+        adjusted_p: after the correction for settings and for the number of models.
+        adjusted_null_p: the same for what it explains in noise of the residual's own colour.
+        alpha: what the adjusted p has to stay below.
+        log_noise: what noise in the log of its channel, brought in by a model adopted before, lets it gain.
+        beside: sum of squares that the models adopted before explain.
+    """
+
+    model: Adopted
+    tried: float
+    terms: Terms
+    assessment: Assessment
+    adjusted_p: float
+    adjusted_null_p: float
+    alpha: float = ALPHA
+    log_noise: float = 0.0
+    beside: float = 0.0
+
+    @property
+    def of_the_log(self) -> bool:
+        """Whether noise in the log of a channel explains what it gains."""
+        return 0.0 < self.assessment.gain.total <= LOG_MARGIN * self.log_noise
+
+    @property
+    def of_second_order(self) -> bool:
+        """Whether it is so small beside what is adopted that the next order of that explains as much.
+
+        Every effect is described to first order, with logs that err: an attitude by a tenth of a degree is an error of
+        0.2 % of a gradient.
+        """
+        return 0.0 < self.assessment.gain.total <= SECOND_ORDER * self.beside
+
+    @property
+    def significant(self) -> bool:
+        """Whether noise does not explain it, all that was tried considered.
+
+        By the scatter over blocks alone; or, because a dozen long blocks tell little of what is very unlikely, in noise
+        of the colour that the residual has without the model, in which it then predicts held-out blocks as well, if the
+        blocks bear it out as a test of this model alone.
+        """
+        if self.adjusted_p < self.alpha:
+            return True
+        unlikely = self.adjusted_null_p < UNLIKELY * self.alpha and self.assessment.null_gain.total > 0
+        return unlikely and self.assessment.p < ALONE and self.assessment.p * self.tried < AMONG_ITS_SETTINGS
+
+    @property
+    def beyond_slow_noise(self) -> bool:
+        """Whether noise of the colour that the residual has without the model, all of it taken for noise, does not
+        explain what the model does: it predicts held-out blocks even so, or that much would be too unlikely.
+
+        What happens once, at the beginning or end, is seen by few blocks, and the others cannot predict it closely
+        enough in noise so strong.
+        """
+        return self.assessment.null_gain.total > 0 or self.adjusted_null_p < self.alpha
+
+    @property
+    def predicts(self) -> bool:
+        """Whether it is significant and predicts held-out blocks, in noise of the colour of what it leaves."""
+        if self.of_the_log or self.of_second_order:
+            return False
+        gain = self.assessment.gain
+        reduction = gain.total / max(float(gain.before.sum()), 1e-300)
+        return self.significant and (gain.consistent or self.predicts_where_it_acts) and reduction > LEAST_REDUCTION
+
+    @property
+    def predicts_where_it_acts(self) -> bool:
+        """Whether a model that acts in a part of the survey only predicts one part of that from the others.
+
+        Then the folds of equal length are but one or two figures, which may gain much and tell no scatter. The short
+        folds in which it acts are not asked unless both the scatter over blocks and noise of the residual's own colour
+        are out of the question, and in noise of that colour it has to predict them as well. Only of what follows a
+        channel: a drift is everywhere, and short folds at its end say no more than that neighbours are alike.
+        """
+        if not any(isinstance(grid, AnyChannel) for grid in profiled(self.model.component).values()):
+            return False
+        focused, null = self.assessment.focused, self.assessment.null_focused
+        if focused is None or null is None or self.assessment.gain.total <= 0:
+            return False
+        unlikely = self.adjusted_p < self.alpha and self.adjusted_null_p < UNLIKELY * self.alpha
+        return unlikely and focused.consistent and null.total > 0
+
+    @property
+    def passes(self) -> bool:
+        """Both gates."""
+        return self.predicts and self.beyond_slow_noise
+
+
+def explained_before(state: State) -> float:
+    """Sum of squares of the whitened residual that the adopted models explain together."""
+    if state.terms is None:
+        return 0.0
+    residual = state.residual
+    back = taken_off(residual, state.terms, -np.concatenate(state.theta))
+    return max(back.square() - residual.square(), 0.0) * len(residual.affine) * residual.freedom

@@ -1,0 +1,234 @@
+"""The settings of an error model: which are tried, which explain most, and what they amount to as tests."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from magtensor.calibration.types import Array
+from magtensor.components import Component
+from magtensor.errors import UsageError
+from magtensor.loop.assessment import WHITE, colours_of, estimated, likeliest
+from magtensor.loop.excitation import Excitation
+from magtensor.loop.model import State, regressors
+from magtensor.loop.multiplicity import alike, effective_tests, projected
+from magtensor.loop.residual import Residual
+from magtensor.loop.scoring import Scorer
+from magtensor.loop.separation import SEPARATION
+from magtensor.loop.settings import AnyChannel, EventTimes, Frequencies, Range, profiled
+from magtensor.loop.terms import Terms, joined
+
+LEAST_RATIO = 2.0  # of the time constants, lags or widths of a model adopted twice
+SCREENING_SAMPLES = 2000  # settings are profiled on so many samples
+REFINING_SAMPLES = 6000  # and the best of them refined on so many
+MOST_OF_IT = 0.75  # of what a model explains, if it is to be made about other settings
+_REFINEMENTS = 8
+
+
+def repeatable(model: Component) -> bool:
+    """A model that can be adopted more than once, with other settings.
+
+    One that chooses a channel, time or line may act through several; a time constant, lag or width is seldom a single
+    one, and what a second leaves is better called more of the same than something else.
+    """
+    grids = profiled(model).values()
+    return any(isinstance(g, (AnyChannel, EventTimes, Frequencies)) or _of_ratios(g) for g in grids)
+
+
+def _of_ratios(grid: Any) -> bool:
+    """A setting whose values differ by factors: a time constant, lag or width."""
+    return isinstance(grid, Range) and (grid.low >= 0 or grid.spacing == "log")
+
+
+def settings_grid(model: Component, x: Excitation) -> list[dict[str, Any]]:
+    """Every combination of the grids of a model's settings."""
+    grids = {name: mark.values(x) for name, mark in profiled(model).items()}
+    combinations: list[dict[str, Any]] = [{}]
+    for name, values in grids.items():
+        combinations = [{**c, name: v} for c in combinations for v in values]
+    return combinations
+
+
+def _already(state: State, model: Component, settings: Mapping[str, Any]) -> bool:
+    """Whether a model is in already with the same channel, and settings on ranges so near that the two could not be
+    told apart."""
+    grids = profiled(model)
+    channels = {n for n, g in grids.items() if isinstance(g, AnyChannel)}
+    ranges = {n for n, g in grids.items() if _of_ratios(g)}
+    same = channels or set(grids) - ranges
+    return any(
+        all(adopted.settings.get(n) == settings.get(n) for n in same)
+        and not any(_apart(adopted.settings[n], settings[n]) for n in ranges)
+        for adopted in state.adopted
+        if adopted.name == model.name
+    )
+
+
+def _apart(one: float, other: float) -> bool:
+    return abs(one - other) > (LEAST_RATIO - 1.0) * min(abs(one), abs(other))
+
+
+def terms_of(model: Component, settings: Mapping[str, Any], x: Excitation, failed: dict[str, str]) -> Terms | None:
+    """The model's regressors; None, and why, where it cannot make them or they are not finite."""
+    try:
+        terms = regressors(model, x, settings)
+    except (KeyError, ValueError, UsageError) as error:
+        failed[model.name] = str(error)
+        return None
+    if not np.isfinite(terms.series).all():
+        failed[model.name] = "its regressors are not finite on this survey"
+        return None
+    return terms
+
+
+@dataclass(frozen=True)
+class Thinned:
+    """Some samples of a residual, on which settings are profiled, and how terms score there.
+
+    Attributes:
+        every, own: what models see of all samples, and of these.
+        freedom: (n, 4) orthonormal, what the fit's own freedom follows.
+        white, coloured: in white noise and in noise of the residual's own colour.
+    """
+
+    residual: Residual
+    every: Excitation
+    own: Excitation
+    freedom: Array
+    white: Scorer
+    coloured: Scorer
+
+    @classmethod
+    def of(cls, state: State, most: int) -> Thinned:
+        residual, given = thinned(state, most)
+        colours = state.colours if residual is state.residual else colours_of(residual)
+        x = state.excitation
+        scorers = Scorer(residual, given, WHITE), Scorer(residual, given, colours)
+        return cls(residual, x, x.at(residual.samples), np.linalg.qr(residual.affine)[0], *scorers)
+
+    def terms(self, model: Component, settings: Mapping[str, Any], failed: dict[str, str]) -> Terms | None:
+        """As `terms_of`, at the samples."""
+        if model.pointwise:
+            return terms_of(model, settings, self.own, failed)
+        terms = terms_of(model, settings, self.every, failed)
+        return None if terms is None else terms.at(self.residual.samples)
+
+
+def thinned(state: State, most: int) -> tuple[Residual, Terms | None]:
+    """At most so many samples of a residual, evenly chosen, and the adopted terms there."""
+    count = len(state.residual.affine)
+    if count <= most:
+        return state.residual, state.terms
+    thin = np.arange(0, count, -(-count // most))
+    return state.residual.smaller(thin), None if state.terms is None else state.terms.at(thin)
+
+
+def best_settings(
+    model: Component, state: State, few: Thinned, failed: dict[str, str], alpha: float
+) -> list[tuple[dict[str, Any], float]]:
+    """The settings that explain most in white noise and in noise of the residual's own colour, if they differ.
+
+    In white noise what is slow decides, in coloured noise what is fast. Beside each the number of independent tests
+    that all settings amount to.
+    """
+    grid = [g for g in settings_grid(model, state.excitation) if not _already(state, model, g)]
+    if len(grid) == 1:
+        return [(grid[0], 1.0)]
+    scores: list[tuple[float, float, dict[str, Any]]] = []
+    chain: list[float] = []
+    last: Array | None = None
+    for settings in grid:
+        terms = few.terms(model, settings, failed)
+        if terms is None or not terms.count:
+            continue
+        scores.append((few.white(terms), few.coloured(terms), settings))
+        series = projected(terms, few.freedom)
+        if last is not None:
+            chain.append(alike(last, series))
+        last = series
+    if not scores:
+        return []
+    tried = effective_tests(chain, alpha)
+    best = max(scores, key=lambda s: s[0])[2], max(scores, key=lambda s: s[1])[2]
+    return [(settings, tried) for settings in (best[:1] if best[0] is best[1] else best)]
+
+
+def refined(model: Component, settings: dict[str, Any], state: State, failed: dict[str, str]) -> dict[str, Any]:
+    """Settings on a range, moved between the neighbours of the best grid value by golden section; a lag of none stays
+    one where the data do not separate the two."""
+    few = thinned(state, REFINING_SAMPLES)
+    for name, grid in profiled(model).items():
+        if not isinstance(grid, (Range, EventTimes)):
+            continue
+        values = sorted(grid.values(state.excitation))
+        place = int(np.argmin(np.abs(np.array(values) - settings[name])))
+        low, high = values[max(place - 1, 0)], values[min(place + 1, len(values) - 1)]
+        terms = terms_of(model, settings, state.excitation, failed)
+        if terms is None or high <= low:
+            continue
+        residual, given = few
+        terms = terms.at(residual.samples)
+        together = terms if given is None else joined([given, terms])
+        score = Scorer(residual, given, likeliest(residual, together, [colours_of(residual), WHITE]).colours)
+
+        def gain(value: float, name: str = name, score: Scorer = score, rest: dict[str, Any] = settings) -> float:
+            found = terms_of(model, {**rest, name: value}, state.excitation, failed)
+            return -np.inf if found is None else score(found.at(few[0].samples))
+
+        best = golden(gain, low, high, settings[name])
+        if low <= 0.0 <= high and _of_ratios(grid) and gain(best) - gain(0.0) < SEPARATION / 2.0:
+            best = 0.0
+        settings = {**settings, name: best}
+    return _about_what_it_fits(model, settings, state, failed) if model.about is not None else settings
+
+
+def _about_what_it_fits(
+    model: Component, settings: dict[str, Any], state: State, failed: dict[str, str]
+) -> dict[str, Any]:
+    """Settings about which a model is linear, moved to where its coefficients are, unless it explains far less there.
+
+    In white noise: what is slow determines such coefficients, and the noise of the regressors themselves is fast. Of a
+    delay, the lag that it is sought about hardly matters; if it matters, it is noise of the regressor.
+    """
+    residual, given = thinned(state, REFINING_SAMPLES)
+    score = Scorer(residual, given, WHITE)
+
+    def at(settings: Mapping[str, Any]) -> Terms | None:
+        terms = terms_of(model, settings, state.excitation, failed)
+        return None if terms is None else terms.at(residual.samples)
+
+    first = terms = at(settings)
+    assert model.about is not None
+    moved = settings
+    for _ in range(_REFINEMENTS):
+        if terms is None:
+            return settings
+        together = terms if given is None else joined([given, terms])
+        theta = estimated(residual, together, WHITE).theta[together.count - terms.count :]
+        moved, before = dict(model.about(moved, theta)), moved
+        if moved == before:
+            break
+        terms = at(moved)
+    return moved if first is not None and terms is not None and score(terms) >= MOST_OF_IT * score(first) else settings
+
+
+def golden(f: Callable[[float], float], low: float, high: float, best: float) -> float:
+    """Where f is largest between two limits, by golden section; `best` if nothing exceeds f there."""
+    ratio = (np.sqrt(5.0) - 1) / 2
+    a, b = low, high
+    c, d = b - ratio * (b - a), a + ratio * (b - a)
+    fc, fd, known = f(c), f(d), f(best)
+    for _ in range(_REFINEMENTS):
+        if fc > fd:
+            b, d, fd = d, c, fc
+            c = b - ratio * (b - a)
+            fc = f(c)
+        else:
+            a, c, fc = c, d, fd
+            d = a + ratio * (b - a)
+            fd = f(d)
+    value, top = (c, fc) if fc > fd else (d, fd)
+    return float(value) if top > known else best
