@@ -35,7 +35,7 @@ from loop_surveys import EFFECTS, recorded
 
 from magtensor.errors import MagtensorError
 from magtensor.loop.contribution import removal
-from magtensor.loop.errors_before_after import held_out_error
+from magtensor.loop.errors_before_after import folds_for, held_out_error
 from magtensor.loop.model import Fitting
 from magtensor.loop.search import search
 from magtensor.loop.unexplained import unexplained
@@ -67,8 +67,8 @@ def tried(trial: Trial) -> dict[str, Any]:
         "description": left["description"],
         "looks_like": left["looks_like"],
         "left": float(np.sqrt(last.residual.square())),
-        "before": _all(held_out_error(record, [], how, [], last.fit.keep)),
-        "after": _all(held_out_error(found.record, last.adopted, how, last.theta, last.fit.keep)),
+        "before": _all(held_out_error(record, [], how, [], last.fit.keep, folds_for(last))),
+        "after": _all(held_out_error(found.record, last.adopted, how, last.theta, last.fit.keep, folds_for(last))),
         "removal": [removal(last, i) for i in range(len(last.adopted))],
     }
 

@@ -70,7 +70,7 @@ def close_loop(
     from magtensor.effect_errors import coefficient_variables, with_coefficients
     from magtensor.loop.correction import as_elsewhere
     from magtensor.loop.decisions import Decision, decision_of
-    from magtensor.loop.errors_before_after import held_out_error
+    from magtensor.loop.errors_before_after import folds_for, held_out_error
     from magtensor.loop.inquiry import inquiry_of
     from magtensor.loop.model import Fitting, with_colour
     from magtensor.loop.near_nominal import doubt_of, labelled, settled
@@ -99,10 +99,11 @@ def close_loop(
     begin, how = inquiry.declared, inquiry.how
     looked_at, keep = found.record, found.last.fit.keep
     left = unexplained(found, looked_at)
-    before = held_out_error(looked_at, begin, how, found.first.theta, keep)
+    folds = folds_for(found.last)
+    before = held_out_error(looked_at, begin, how, found.first.theta, keep, folds)
     same = len(found.last.adopted) == len(begin)
     seen = as_elsewhere(looked_at, calibrated(found.last.fit), found.last)
-    after = before if same else held_out_error(seen, found.last.adopted, how, found.last.theta, keep)
+    after = before if same else held_out_error(seen, found.last.adopted, how, found.last.theta, keep, folds)
     found = inquiry.on_every_sample(found)
     first, last, record = found.first, with_colour(found.record, found.last, how), found.record
     calibration, errors = calibrated(last.fit), {}

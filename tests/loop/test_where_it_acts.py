@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
-from loop_cases import Array, linear_state, synthetic
+import pytest
+from loop_cases import BASE, Array, adopted_names, linear_state, scenario, synthetic, verdict_of
 
+from magtensor.components import Component
+from magtensor.loop.assessment import WHITE
+from magtensor.loop.errors_before_after import folds_for
+from magtensor.loop.evidence import grams
 from magtensor.loop.gates import ALPHA, SECOND_ORDER, Candidate
+from magtensor.loop.model import Adopted, Fitting, Record, joint_state
 from magtensor.loop.outcome import why
 from magtensor.loop.screening import candidates_of
-from magtensor.loop.statistics import LEAST_T
+from magtensor.loop.statistics import LEAST_T, focused_folds
 from magtensor.registry import Registry
 
 SAMPLES = 1200  # one a second
@@ -24,12 +31,20 @@ def pump(rng: np.random.Generator) -> Array:
     return out
 
 
-def looked_at(seed: int, current: Array, added: Array) -> Candidate:
-    """The current's field as a candidate on a survey where `added` (N, S, 3) nT is in the outputs."""
+def model(name: str) -> Component:
+    return Registry.load().find("error_model", name)
+
+
+def survey_with(seed: int, current: Array, added: Array) -> Record:
+    """A survey that logs a current, with `added` (N, S, 3) nT in the outputs."""
     record = synthetic(seed, samples=SAMPLES, noise_nT=0.2, added=added)
     logged = {"current_pump": current - current.mean()}
-    record = replace(record, logged=logged, means={"current_pump": current.mean()}, units={"current_pump": "A"})
-    (found,) = candidates_of(linear_state(record), [Registry.load().find("error_model", "current_field")], {}, ALPHA)
+    return replace(record, logged=logged, means={"current_pump": current.mean()}, units={"current_pump": "A"})
+
+
+def looked_at(seed: int, current: Array, added: Array) -> Candidate:
+    """The current's field as a candidate on such a survey."""
+    (found,) = candidates_of(linear_state(survey_with(seed, current, added)), [model("current_field")], {}, ALPHA)
     return found
 
 
@@ -52,13 +67,52 @@ def test_another_disturbance_while_it_ran_is_not_the_pump() -> None:
         assert not looked_at(seed, current, other).passes
 
 
-def test_folds_that_know_equally_much_do_not_follow_the_data() -> None:
-    rng = np.random.default_rng(9)
-    current = pump(rng)
-    found = [looked_at(3, current, nT * current[:, None, None] * np.ones((4, 3))) for nT in (0.0, 0.02, 0.04)]
-    folds = [one.assessment.null_focused for one in found]
-    assert len({None if one is None else len(one.before) for one in folds}) == 1
-    assert not any(one.passes for one in found[:1])
+def test_folds_are_short_where_it_acts_and_the_same_whatever_the_data() -> None:
+    current = pump(np.random.default_rng(9))
+
+    def folds(nT: float) -> list[int]:
+        state = linear_state(survey_with(3, current, nT * current[:, None, None] * np.ones((4, 3))))
+        terms = model("current_field").function(state.excitation, channel="current_pump").at(state.residual.samples)
+        blocks = grams(state.residual, terms, WHITE.across, WHITE.along, SAMPLES // 10)
+        return [10 * int(edge) for edge in focused_folds(blocks, np.zeros(terms.count, dtype=bool))]
+
+    assert folds(0.0) == folds(0.1) == folds(0.2)
+    inner = np.array(folds(0.0)[1:-1])
+    assert len(inner) >= 8 and np.all((inner > RAN.start) & (inner <= RAN.stop))
+
+
+def test_the_folds_of_the_third_gate_divide_what_happens_once() -> None:
+    record = survey_with(4, pump(np.random.default_rng(10)), np.zeros((SAMPLES, 4, 3)))
+    steady = Adopted(model("nonlinearity_cubic"), {})
+    once = Adopted(model("current_field"), {"channel": "current_pump"})
+    passes = Adopted(model("passing_source"), {"time_s": 1000.0, "passage_s": 10.0})
+
+    def folds(*adopted: Adopted) -> list[int]:
+        return folds_for(joint_state(record, adopted, Fitting())).tolist()
+
+    equal = [0, 240, 480, 720, 960, 1200]
+    assert folds() == folds(steady) == equal
+    while_it_ran = sorted(set(folds(steady, once)) - set(equal))
+    assert len(while_it_ran) == 4 and RAN.start < while_it_ran[0] and while_it_ran[-1] < RAN.stop
+    nearest = sorted(set(folds(passes)) - set(equal))
+    assert len(nearest) == 4 and 985 < nearest[0] and nearest[-1] < 1015
+    assert nearest[0] + nearest[-1] == pytest.approx(2000, abs=3)  # it is as long coming as it is going
+
+
+def test_a_vehicle_that_passed_is_found_wherever_the_folds_lie(tmp_path: Path) -> None:
+    track = {"closest_m": [9.0, 0.0, -1.0], "velocity_m_s": [0.0, 0.6, 0.0]}
+    passing = {"type": "passing_source", "rms_nT": 0.6, "time_s": 610.0} | track
+    motion = BASE["motion"] | {"duration_s": 1000.0}
+    models = ("passing_source", "reference_step", "reference_drift", "nonlinearity_cubic")
+
+    told = verdict_of(tmp_path, scenario(31, passing, motion=motion), models=models)
+
+    assert adopted_names(told) == {"passing_source"}
+    settings = told["adopted"][0]["settings"]
+    assert settings["time_s"] == pytest.approx(610.0, abs=2.0)
+    assert settings["passage_s"] == pytest.approx(np.sqrt(82.0) / 0.6, rel=0.1)
+    before, after = (told["error"]["held_out"][k]["total_field_rms_nT"]["all"] for k in ("before", "after"))
+    assert after < 0.5 * before
 
 
 def test_the_next_order_of_something_strong_is_no_effect() -> None:

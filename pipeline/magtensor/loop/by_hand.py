@@ -20,7 +20,7 @@ from magtensor.loop.outcome import why
 from magtensor.loop.screening import candidates_of
 from magtensor.loop.search import simplest
 from magtensor.loop.settings import AnyChannel, profiled
-from magtensor.loop.trial import trial
+from magtensor.loop.trial import on_the_folds_of, trial
 
 ADOPTED = "{} is adopted already; reject it or undo first to adopt it otherwise"
 
@@ -55,8 +55,8 @@ def adopted(record: Record, state: State, chosen: Candidate, ranking: Sequence[C
     DataError: the model has nothing of its own on this survey.
     """
     part = _new_directions(chosen, state)
-    standing = trial(record, state, how)
     after = trial(record, adopt(record, state, chosen, how), how)
+    standing = on_the_folds_of(after, record, trial(record, state, how), how)
     record, refitted = renewed(record, after.state, how)
     name = chosen.model.name
     first, others = simplest(chosen, [c for c in ranking if c.predicts and c.model.name != name], state)

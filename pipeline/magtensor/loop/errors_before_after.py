@@ -12,15 +12,48 @@ from magtensor.accuracy import error_block
 from magtensor.calibration.joint import nearest_frame
 from magtensor.calibration.types import Array
 from magtensor.errors import DataError, NotEnoughData
-from magtensor.loop.model import Adopted, Fitting, Record, excitation_of, joint_state, without
+from magtensor.loop.model import Adopted, Fitting, Record, State, excitation_of, joint_state, without
+from magtensor.loop.terms import Terms
 from magtensor.sharing import shared_out
 from magtensor.tensor.assembly import least_squares_assembly
 
 FOLDS = 5
+NEARLY_ALL = 0.8  # of what is known of an effect: the other folds can then not say what it is
+
+
+def folds_for(state: State) -> NDArray[np.int_]:
+    """Where the folds begin and end that the models of a fit can be judged on: a number of samples each.
+
+    Folds of equal length. Where two neighbours hold nearly all that can be known of a model, they are divided into as
+    many that know equally much: one part of a vehicle's passing is predicted by its other parts, and by nothing else.
+    What is known follows from the regressors, not from the data.
+    """
+    n = len(state.excitation.time)
+    edges = np.linspace(0, n, FOLDS + 1).round().astype(int)
+    divided = set(edges.tolist())
+    for model in state.adopted:
+        known = _known_until(model.terms(state.excitation))
+        held = known[edges[2:]] - known[edges[:-2]]
+        if held.max() > NEARLY_ALL:
+            inner = known[edges[held.argmax()]] + held.max() * np.arange(1, FOLDS) / FOLDS
+            divided.update(np.searchsorted(known, inner).tolist())
+    return np.array(sorted(divided))
+
+
+def _known_until(terms: Terms) -> Array:
+    """(N + 1,) part of what is known of a model's coefficients, constants left out, that so many samples know."""
+    square = (terms.series - terms.series.mean(axis=0)) ** 2
+    share = square / np.maximum(square.sum(axis=0), 1e-300)
+    return np.concatenate([[0.0], np.cumsum(share[:, terms.part_series].mean(axis=1))])
 
 
 def held_out_error(
-    record: Record, adopted: Sequence[Adopted], how: Fitting, start: Sequence[Array], keep: NDArray[np.bool_]
+    record: Record,
+    adopted: Sequence[Adopted],
+    how: Fitting,
+    start: Sequence[Array],
+    keep: NDArray[np.bool_],
+    edges: NDArray[np.int_],
 ) -> dict[str, Any] | None:
     """Error figures over contiguous folds, each calibrated with the samples of the others.
 
@@ -30,13 +63,13 @@ def held_out_error(
     adopted: the error models, with their settings; their coefficients are fitted anew for every fold.
     start: coefficients to begin with; what they converge to does not depend on them.
     keep: (N,) samples that a fit may believe.
+    edges: (folds + 1,) where the folds begin and end (`folds_for`); errors are comparable over the same ones.
 
     Returns
     -------
     The error block of `magtensor.accuracy.error_block`; None where the other folds do not determine a calibration.
     """
-    n, sensors = len(record.time), len(record.sensors)
-    edges = np.linspace(0, n, FOLDS + 1).round().astype(int)
+    sensors = len(record.sensors)
 
     def calibrated_fold(k: int) -> tuple[Array, Array | None] | None:
         test = slice(edges[k], edges[k + 1])
@@ -52,7 +85,7 @@ def held_out_error(
         matrix = np.linalg.inv(state.fit.forward @ nearest_frame(state.fit.forward))
         return np.einsum("sij,nsj->nsi", matrix, raw[test] - state.fit.offset), None if field is None else field[test]
 
-    folds = shared_out(calibrated_fold, range(FOLDS))
+    folds = shared_out(calibrated_fold, range(len(edges) - 1))
     b, reference = [], []
     for fold in folds:
         if fold is None:

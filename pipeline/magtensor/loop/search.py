@@ -29,7 +29,7 @@ from magtensor.loop.screening import candidates_of, generic
 from magtensor.loop.separation import SEPARATION, fold_gain, separated
 from magtensor.loop.settings import EventTimes, profiled
 from magtensor.loop.spectrum import spectral_lines
-from magtensor.loop.trial import Trial, trial
+from magtensor.loop.trial import Trial, on_the_folds_of, trial
 
 MOST_EFFECTS = 8
 ROUNDING = 1e-4  # mean square of the whitened residual: far below the least noise that any sensor is believed to have
@@ -194,6 +194,7 @@ def _kept(record: Record, before: Trial, chosen: Candidate, how: Fitting) -> tup
         after = trial(record, polished(record, adopt(record, before.state, chosen, how), how), how)
     except DataError as error:  # with coefficients that run away nothing is left to calibrate
         return None, f"it cannot be fitted: {error.what.split(':')[0]}"
+    before = on_the_folds_of(after, record, before, how)
     hurt = before.hurt_by(after)
     if hurt:
         which = len(before.state.adopted)
@@ -201,6 +202,7 @@ def _kept(record: Record, before: Trial, chosen: Candidate, how: Fitting) -> tup
         helped = [s for s in before.helped_by(after) if s in own]
         if helped and set(chosen.terms.sensors) >= set(own):
             after = trial(record, narrowed(record, after.state, which, tuple(helped), how), how)
+            before = on_the_folds_of(after, record, before, how)
             hurt = before.hurt_by(after)
     if hurt:
         return None, f"fitted, it raises the held-out error of {', '.join(hurt)}"

@@ -252,15 +252,20 @@ def focused_gain(g: Grams, freedom: int, blocked: NDArray[np.bool_]) -> Gain | N
     """The same over contiguous folds that know equally much of the terms; None where a few blocks know nearly all.
 
     What acts in one part of a survey only lies in one fold of equal length, and what the others predict of it is one
-    figure. Which fold is how long follows from the terms and not from the data.
+    figure.
     """
-    known = np.cumsum(_share_of_blocks(g, ~blocked))
-    edges = np.unique(np.searchsorted(known, np.linspace(0.0, 1.0, FOLDS + 1)[1:-1], side="left") + 1)
-    edges = np.concatenate([[0], edges[edges < len(g.zz)], [len(g.zz)]])
+    edges = focused_folds(g, blocked)
     if len(edges) <= LEAST_BLOCKS:
         return None
     gain = _gain_between(g, freedom, edges, blocked)
     return replace(gain, values=np.full(len(gain.values), gain.values.mean()))  # each fold should gain as much
+
+
+def focused_folds(g: Grams, blocked: NDArray[np.bool_]) -> NDArray[np.int_]:
+    """(folds + 1,) blocks where those folds begin and end: it follows from the terms and not from the data."""
+    known = np.cumsum(_share_of_blocks(g, ~blocked))
+    edges = np.unique(np.searchsorted(known, np.linspace(0.0, 1.0, FOLDS + 1)[1:-1], side="left") + 1)
+    return np.concatenate([[0], edges[edges < len(g.zz)], [len(g.zz)]])
 
 
 def _share_of_blocks(g: Grams, chosen: NDArray[np.bool_]) -> Array:

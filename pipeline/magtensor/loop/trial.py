@@ -9,8 +9,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+from numpy.typing import NDArray
+
 from magtensor.loop.assessment import log_likelihood
-from magtensor.loop.errors_before_after import held_out_error
+from magtensor.loop.errors_before_after import folds_for, held_out_error
 from magtensor.loop.model import Fitting, Record, State
 
 WORST_RISE = 0.10  # of a sensor's |b| - F on held-out blocks; a dozen coefficients cost a hundred samples half of that
@@ -23,10 +26,12 @@ class Trial:
     Attributes:
         state: of the fit.
         error: held-out rms of |b| - F of each sensor, nT; None where blocks alone do not determine a calibration.
+        folds: the samples that each was judged on, as in `held_out_error`.
     """
 
     state: State
     error: dict[str, float] | None
+    folds: NDArray[np.int_]
 
     def hurt_by(self, after: Trial) -> list[str]:
         """Sensors whose error rises."""
@@ -47,11 +52,25 @@ class Trial:
 
 def trial(record: Record, state: State, how: Fitting) -> Trial:
     """Fit the state's models to some blocks and judge them on the others."""
-    block = held_out_error(record, state.adopted, how, state.theta, state.fit.keep)
+    return _judged(record, state, how, state.fit.keep, folds_for(state))
+
+
+def on_the_folds_of(after: Trial, record: Record, before: Trial, how: Fitting) -> Trial:
+    """A trial on the folds of another one, if they are others; then on the samples that one believes, too.
+
+    What happens once may have been flagged before it had a name.
+    """
+    if np.array_equal(before.folds, after.folds):
+        return before
+    return _judged(record, before.state, how, after.state.fit.keep, after.folds)
+
+
+def _judged(record: Record, state: State, how: Fitting, keep: NDArray[np.bool_], folds: NDArray[np.int_]) -> Trial:
+    block = held_out_error(record, state.adopted, how, state.theta, keep, folds)
     figures = (block or {}).get("total_field_rms_nT")
     if figures is None or any(v is None for v in figures.values()):
-        return Trial(state, None)
-    return Trial(state, {s: float(figures[s]) for s in record.sensors})
+        return Trial(state, None, folds)
+    return Trial(state, {s: float(figures[s]) for s in record.sensors}, folds)
 
 
 def _per_sample(state: State) -> float:
