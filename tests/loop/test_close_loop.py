@@ -60,9 +60,10 @@ def test_the_packaged_recipe_is_the_one_of_the_contract() -> None:
 
 def test_the_same_bits_as_the_recipe(tmp_path: Path, surveys: tuple[Path, Path]) -> None:
     survey, verify = surveys
-    from_python = magtensor.close_loop(survey, verify=verify)
+    from_python = magtensor.close_loop(survey, verify=verify, search=SEARCH)
     from_python.save(tmp_path / "python")
-    by_recipe = run_recipe(RECIPE, tmp_path / "recipe", survey=survey, verify=verify)
+    few = [f"stages.close_loop.search=[{', '.join(SEARCH)}]"]
+    by_recipe = run_recipe(RECIPE, tmp_path / "recipe", survey=survey, verify=verify, overrides=few)
     assert content(from_python) == by_recipe.made_by.content_sha256
     verdicts = [(tmp_path / n / "verdict.json").read_text() for n in ("python", "recipe")]
     assert verdicts[0] == verdicts[1]

@@ -43,8 +43,8 @@ def overshadowed(found: Search, fixed: int) -> tuple[str, str] | None:
 
 
 def staying(found: Search) -> float:
-    """nT rms above the white noise that stays and may follow the attitude: without what a significant effect of
-    something else would explain, which was not adopted because it happens once."""
+    """nT rms above the white noise that stays and may follow the attitude: without what the best of the significant
+    effects of something else would explain that a gate refused, as one that happened once and predicts nothing."""
     state, residual = found.last, found.last.residual
     other = 0.0
     for candidate in found.steps[-1].candidates if found.steps else ():
