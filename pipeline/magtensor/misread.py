@@ -8,19 +8,15 @@ rotations, so that where nobody knows the field in the world, the inverse and th
 
 from __future__ import annotations
 
-from itertools import permutations, product
-
 import numpy as np
 
-from magtensor.attitude import into_platform
+from magtensor.attitude import FAR_BETTER, longest, right_angled, seen_from_world
 from magtensor.calibration.types import Array
 from magtensor.errors import DataError
 from magtensor.frame.attitude import LEAST_SAMPLES, WORST_MISFIT
 
-FAR_BETTER = 3.0  # times: a reading that leaves so much less is named
 ALIKE = 1.5  # times: readings that leave no more than the best by this are named too
 MOST_SAMPLES = 20_000  # enough for an angle of some degrees
-_STEPS = 100
 READINGS = {
     "the inverse (`maps: world to platform`)": (np.array([0, 1, 2, 3]), np.array([-1.0, -1.0, -1.0, 1.0])),
     "one with the scalar first (`scalar: first`)": (np.array([1, 2, 3, 0]), np.ones(4)),
@@ -72,28 +68,9 @@ def require_following(quaternions: Array, b: Array, world: Array | None) -> None
 def misfit(quaternions: Array, direction: Array, world: Array | None) -> float:
     """rad rms, what the best rotation of directions (N, 3) leaves; a mirror counts as a rotation, as of an array whose
     axes are all inverted, which is another mistake."""
-    to_world = np.stack([into_platform(quaternions, axis) for axis in np.eye(3)], axis=1)
-    mean = np.einsum("nij,na->ija", to_world, direction) / len(direction)
+    mean = seen_from_world(quaternions, direction)
     if world is not None:
         together = float(np.linalg.svd(np.einsum("i,ija->ja", world, mean), compute_uv=False).sum())
         return float(np.sqrt(max(2.0 - 2.0 * together, 0.0)))
-    length = max(_longest(mean, start) for start in _right_angled())
+    length = max(longest(mean, start)[0] for start in right_angled())
     return float(np.sqrt(max(1.0 - length**2, 0.0)))
-
-
-def _longest(mean: Array, rotation: Array) -> float:
-    """The length of the mean direction in the world, made longest by turns from a start."""
-    length = 0.0
-    for _ in range(_STEPS):
-        h = np.einsum("ija,ja->i", mean, rotation)
-        before, length = length, float(np.linalg.norm(h))
-        if length <= before + 1e-6:
-            break
-        u, _, vt = np.linalg.svd(np.einsum("i,ija->ja", h, mean))
-        rotation = np.asarray(u @ vt)
-    return length
-
-
-def _right_angled() -> list[Array]:
-    found = [np.eye(3)[list(order)] * signs for order in permutations(range(3)) for signs in product((1, -1), repeat=3)]
-    return [np.asarray(p) for p in found if np.linalg.det(p) > 0]

@@ -1,6 +1,7 @@
 """Error models of the calibration site: real fields that are not the Earth's uniform one.
 
-World frame as in `attitude`. They are modelled while calibrating and never taken off another survey's field.
+World frame as in `attitude`, which also tells the rotation between the platform's frame, in which positions are, and
+the common one. They are modelled while calibrating and never taken off another survey's field.
 """
 
 from typing import Annotated
@@ -9,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from magtensor.attitude import into_platform
 from magtensor.calibration.types import Array
 from magtensor.components import error_model
 from magtensor.loop.excitation import AXES, Excitation
@@ -19,25 +19,18 @@ from magtensor.tensor.elements import COMPONENTS, NINE_OF_FIVE
 from magtensor.tensor.geometry import field_polynomials, term_names
 
 
-def _world_axes(x: Excitation) -> Array:
-    """(N, 3, 3): row k is the world's axis k in the platform frame."""
-    if x.attitude is None:
-        raise KeyError("the survey has no attitude")
-    attitude = x.attitude
-    return np.stack([into_platform(attitude, axis) for axis in np.eye(3)], axis=1)
-
-
-def _places(x: Excitation, axes: Array) -> Array:
+def _places(x: Excitation) -> Array:
     """(N, S, 3) m: the sensors in the world about the platform's origin."""
     if x.position is None:
         raise KeyError("the survey has no positions")
-    out: Array = np.einsum("nki,si->nsk", axes, x.position)
+    out: Array = np.einsum("nki,si->nsk", x.world_axes, x.position)
     return out
 
 
-def _seen(x: Excitation, axes: Array, world: Array) -> Array:
+def _seen(x: Excitation, world: Array) -> Array:
     """(N, S, 3) nT on the raw outputs of a field (N, S, 3) in the world frame."""
-    return x.sensed(np.einsum("nki,nsk->nsi", axes, world))
+    turned = x.world_axes @ x.from_platform.T
+    return x.sensed(np.einsum("nki,nsk->nsi", turned, world))
 
 
 @error_model(
@@ -52,11 +45,10 @@ def site_gradient(x: Excitation) -> Terms:
     Five coefficients for all sensors, xx, xy, xz, yy, yz in the world frame. The platform's origin is taken to stay in
     place. Rivals: `fixed_source`, which contains it, and `frame_flexure`.
     """
-    axes = _world_axes(x)
-    places = _places(x, axes)
+    places = _places(x)
     found = []
     for name, element in zip(COMPONENTS, NINE_OF_FIVE.T.reshape(5, 3, 3), strict=True):
-        found.append(x.shared(_seen(x, axes, places @ element), "nT/m", name))
+        found.append(x.shared(_seen(x, places @ element), "nT/m", name))
     return joined(found)
 
 
@@ -78,12 +70,11 @@ def fixed_source(
     by all sensors, are the derivatives of the field in the world frame. Rivals: `site_gradient` for far sources,
     `frame_flexure`.
     """
-    axes = _world_axes(x)
-    places = _places(x, axes)
+    places = _places(x)
     units = {2: "nT/m", 3: "nT/m2", 4: "nT/m3"}
     return joined(
         [
-            x.shared(_seen(x, axes, _harmonic(name, places)), units[each], name)
+            x.shared(_seen(x, _harmonic(name, places)), units[each], name)
             for each in range(2, degree + 1)
             for name in term_names(each)
         ]
@@ -133,15 +124,14 @@ def passing_source(
     dipole = [u**k / (1 + u**2) ** 2.5 for k in range(3)]
     if not whole:
         return joined([x.shared(f[:, None, None] * x.along, "nT", f"u{k}") for k, f in enumerate(dipole)])
-    axes = _world_axes(x)
-    places = _places(x, axes)
+    places = _places(x)
     patterns = [(AXES[i], "nT", np.broadcast_to(axis, x.output.shape), dipole) for i, axis in enumerate(np.eye(3))]
     steeper = [u**k / (1 + u**2) ** 3.5 for k in range(4)]
     for name, element in zip(COMPONENTS, NINE_OF_FIVE.T.reshape(5, 3, 3), strict=True):
         patterns.append((name, "nT/m", places @ element, steeper))
     return joined(
         [
-            x.shared(f[:, None, None] * _seen(x, axes, world), units, f"{name} u{k}")
+            x.shared(f[:, None, None] * _seen(x, world), units, f"{name} u{k}")
             for name, units, world, shapes in patterns
             for k, f in enumerate(shapes)
         ]

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import permutations, product
 
 import numpy as np
 
+from magtensor.attitude import right_angled
 from magtensor.calibration.rotation import angle_between, from_vector, to_vector
 from magtensor.calibration.types import PARAMETERS_PER_SENSOR, Array, ArrayCalibration
 from magtensor.errors import NotEnoughData
@@ -89,7 +89,7 @@ def common_rotation(sources: Sequence[Source], errors: CalibrationErrors, *, wor
     from scipy.special import chdtri
 
     spreads = [s.spread(np.eye(3)) for s in sources]
-    starts = _right_angled()
+    starts = right_angled()
     minima: list[tuple[float, Array]] = []
     for _ in range(2):
         minima = _minima(sources, spreads, starts)
@@ -152,18 +152,6 @@ def axis_in_words(direction: Array) -> str:
     if abs(direction[k]) > np.cos(np.radians(3.0)):
         return f"{'-' if direction[k] < 0 else ''}{'xyz'[k]}"
     return f"({', '.join(f'{v:.2f}' for v in direction)})"
-
-
-def _right_angled() -> list[Array]:
-    """The 24 proper rotations that take axes to axes, the one that turns nothing first."""
-    found = []
-    for order in permutations(range(3)):
-        for signs in product((1.0, -1.0), repeat=3):
-            matrix = np.zeros((3, 3))
-            matrix[range(3), order] = signs
-            if np.linalg.det(matrix) > 0:
-                found.append(matrix)
-    return sorted(found, key=lambda p: -float(np.trace(p)))
 
 
 def _sum(slopes: Sequence[Slope]) -> Slope:

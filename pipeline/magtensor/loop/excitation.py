@@ -11,6 +11,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from magtensor.attitude import into_platform, into_platform_frame
 from magtensor.calibration.types import Array
 from magtensor.errors import did_you_mean
 from magtensor.loop.held_logs import unheld
@@ -164,6 +165,28 @@ class Excitation:
         each = vectors[:, None] if vectors.ndim == 2 else vectors
         out: Array = np.einsum("sij,nsj->nsi", self.matrix, np.broadcast_to(each, self.output.shape))
         return out
+
+    @cached_property
+    def world_axes(self) -> Array:
+        """(N, 3, 3): row k is the world's axis k in the platform frame.
+
+        Raises:
+            KeyError: the survey has no attitude.
+        """
+        if self.attitude is None:
+            raise KeyError("the survey has no attitude")
+        attitude = self.attitude
+        return np.stack([into_platform(attitude, axis) for axis in np.eye(3)], axis=1)
+
+    @cached_property
+    def from_platform(self) -> Array:
+        """(3, 3): takes vectors of the platform frame into the common one, which a calibration without attitude puts
+        near the mean of the sensors' axes, a degree from the platform's; the unit matrix without attitude."""
+        if self.part_of is not None:
+            return self.part_of[0].from_platform
+        if self.attitude is None:
+            return np.eye(3)
+        return into_platform_frame(self.attitude, self.field.mean(axis=1)).T
 
     @cached_property
     def along(self) -> Array:
