@@ -18,8 +18,8 @@ from magtensor.loop.colour import Colour, colour_of
 from magtensor.loop.correction import corrected_raw
 from magtensor.loop.model import Adopted, Fitting, joint_state
 from magtensor.loop.multiplicity import effective_tests
-from magtensor.loop.quiet import quieted
 from magtensor.loop.scoring import rarity
+from magtensor.loop.smoothing import smoothed
 from magtensor.loop.turned import SlowModes, TurnedColour, excess_of, excess_of_one
 from magtensor.registry import Registry
 
@@ -94,15 +94,38 @@ def test_slow_noise_of_a_turning_sensor_is_not_mistaken_for_a_slow_effect(single
     assert np.mean(explained["turned"]) < (9.0 if single else 6.0)
 
 
-def test_a_thermometer_without_the_noise_of_its_log() -> None:
+BENDS = 1e-4  # degC a sample^2, white: an integrated random walk
+
+
+def heated(rng: np.random.Generator, samples: int) -> Array:
+    """degC, (N,), two a second: switched on at the first sample, on a day with clouds."""
+    clouds = BENDS * np.cumsum(np.cumsum(rng.standard_normal(samples)))
+    return 18.0 + 4.0 * (1.0 - np.exp(-np.arange(samples) / 480.0)) + clouds
+
+
+@pytest.mark.parametrize("noise", [0.005, 0.02, 0.1])
+def test_a_thermometer_without_the_noise_of_its_log(noise: float) -> None:
     rng = np.random.default_rng(8)
-    n = 4000
-    true = 20.0 + np.cumsum(np.cumsum(rng.standard_normal(n))) * 1e-4
-    logged = true + 0.1 * rng.standard_normal(n)
-    assert np.std(quieted(logged) - true) < 0.25 * 0.1
-    np.testing.assert_allclose(quieted(true), true, atol=1e-3 * np.ptp(true))
-    rough = rng.standard_normal(n)  # nothing slow in it: what is logged may be what there is
-    np.testing.assert_array_equal(quieted(rough), rough)
+    true = heated(rng, 3600)
+    error = smoothed(true + noise * rng.standard_normal(3600)) - true
+    # the best that is possible, knowing noise and bends: noise^2 times the mean of 1 / (1 + (noise / BENDS)^2 w^4) over
+    # all frequencies w, which is (BENDS / noise)^(1/2) / 8^(1/2)
+    best = noise * np.sqrt(np.sqrt(BENDS / noise) / np.sqrt(8.0))
+    assert np.std(error) < 1.15 * best
+    assert np.sqrt(np.mean(error[:60] ** 2)) < 3.0 * best  # where it warms up fastest, and has no past
+    assert np.std(np.diff(error)) < 0.05 * noise  # what a rate of change is made of
+
+
+def test_a_log_without_noise_or_without_a_signal_is_used_as_it_is() -> None:
+    rng = np.random.default_rng(9)
+    true = heated(rng, 3600)
+    np.testing.assert_allclose(smoothed(true), true, atol=1e-4 * np.ptp(true))
+    line = np.linspace(20.0, 25.0, 60_000)
+    np.testing.assert_allclose(smoothed(line), line, atol=1e-6)  # the stiffest course of all, far from rounding
+    rough = rng.standard_normal(4000)  # nothing slow in it: what is logged may be what there is
+    np.testing.assert_array_equal(smoothed(rough), rough)
+    rounded = np.round(true, 1)  # held in steps: no noise that second differences would show
+    np.testing.assert_array_equal(smoothed(rounded), rounded)
 
 
 def two_unlike(seed: int, *effects: dict[str, Any]) -> dict[str, Any]:

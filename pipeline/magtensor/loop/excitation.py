@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
@@ -18,7 +19,6 @@ from magtensor.loop.held_logs import unheld
 from magtensor.loop.terms import REFERENCE, Terms
 
 AXES = "xyz"
-LONG_LAG = 20.0  # samples: of white noise a sixth is left behind it
 VECTORS = ("acceleration", "angular_rate")  # channels with a value for each axis whatever the number of sensors
 
 
@@ -42,6 +42,8 @@ class Excitation:
         lines: Hz, the strongest lines in the residual's spectrum, for models that look for one.
         waveform: (N,) of a source that nobody logged, found in what the sensors share; None where none was.
         part_of: what this is a part of, and the numbers of the samples in it; None for a whole survey.
+        courses: name of a thermometer -> its log, and its course without the noise of the log; filled as they are
+            asked for, so that one is made for all fits of a record.
     """
 
     time: Array
@@ -59,6 +61,7 @@ class Excitation:
     lines: Sequence[float] = ()
     waveform: Array | None = None
     part_of: tuple[Excitation, NDArray[np.int_]] | None = None
+    courses: dict[str, tuple[Array, Array]] = dataclasses.field(default_factory=dict, compare=False, repr=False)
 
     def at(self, samples: NDArray[np.int_]) -> Excitation:
         """What an error model sees that looks at some of the samples only, each by itself. Logged channels are seen
@@ -110,8 +113,7 @@ class Excitation:
 
     def thermometer(self, name: str, lag_s: float = 0.0) -> Array:
         """A logged temperature without the noise of its log, seen through a lag: what has a thermal mass does not jump,
-        neither between samples nor where a log that is written seldom has a new value. A lag of many samples takes off
-        the white noise itself, and nothing of what happened at once, such as switching on."""
+        neither between samples nor where a log that is written seldom has a new value."""
         return self._course(name, lag_s, smooth=True)
 
     def _course(self, name: str, lag_s: float, smooth: bool) -> Array:
@@ -119,14 +121,17 @@ class Excitation:
             whole, samples = self.part_of
             return whole._course(name, lag_s, smooth)[samples]
         key = name, lag_s, smooth
-        if key not in self._courses:
-            values = self.channel(name)
-            if smooth:
-                quiet = lag_s < LONG_LAG * self.spacing
-                columns = [unheld(self.time, c, quiet=quiet) for c in values.reshape(len(values), -1).T]
-                values = np.column_stack(columns).reshape(values.shape)
-            self._courses[key] = self.lagged(values, lag_s) if lag_s else values
-        return self._courses[key]
+        if key not in self._lagged:
+            values = self._without_noise(name) if smooth else self.channel(name)
+            self._lagged[key] = self.lagged(values, lag_s) if lag_s else values
+        return self._lagged[key]
+
+    def _without_noise(self, name: str) -> Array:
+        log = self.channel(name)
+        if name not in self.courses or self.courses[name][0] is not log:
+            columns = [unheld(self.time, column) for column in log.reshape(len(log), -1).T]
+            self.courses[name] = log, np.column_stack(columns).reshape(log.shape)
+        return self.courses[name][1]
 
     def is_vector(self, name: str) -> bool:
         """Whether a logged channel has a value for each axis rather than one, or one for each sensor."""
@@ -134,7 +139,7 @@ class Excitation:
         return len(shape) == 2 and shape[1] == 3 and (len(self.sensors) != 3 or name in VECTORS)
 
     @cached_property
-    def _courses(self) -> dict[tuple[str, float, bool], Array]:
+    def _lagged(self) -> dict[tuple[str, float, bool], Array]:
         return {}
 
     @cached_property

@@ -57,7 +57,7 @@ def brought_in(state: State, settings: Mapping[str, Any]) -> float:
         for name in channels & {v for v in model.settings.values() if isinstance(v, str)}:
             values = x.logged[name]
             noise = rng.standard_normal(values.shape) * white_noise(values, x.run).reshape(values.shape[1:])
-            noisy = replace(x, logged={**x.logged, name: values + noise})
+            noisy = replace(x, logged={**x.logged, name: values + noise}, courses={})
             added = model.terms(noisy).contribution(theta, len(residual.noise))
             added = (added - model.terms(x).contribution(theta, len(residual.noise)))[residual.samples] / residual.noise
             if residual.across is not None:

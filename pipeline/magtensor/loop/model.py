@@ -45,6 +45,7 @@ class Record:
         position: (S, 3) m or None; attitude: (N, 4) or None.
         samples: (N,) their numbers in the survey.
         waveform: (N,) of a source that nobody logged, once it was found.
+        courses: of its thermometers, as in Excitation.
     """
 
     time: Array
@@ -62,6 +63,7 @@ class Record:
     attitude: Array | None
     samples: NDArray[np.int_]
     waveform: Array | None = None
+    courses: dict[str, tuple[Array, Array]] = field(default_factory=dict, compare=False, repr=False)
 
     def at(self, keep: NDArray[np.int_]) -> Record:
         """Some of the samples."""
@@ -77,13 +79,14 @@ class Record:
             attitude=None if self.attitude is None else self.attitude[keep],
             samples=self.samples[keep],
             waveform=None if self.waveform is None else self.waveform[keep],
+            courses={},
         )
 
     def excitation(self, output: Array, field_: Array, lines: Sequence[float] = ()) -> Excitation:
         """What error models see, given the modelled outputs and fields (N, S, 3)."""
         return Excitation(
             self.time, self.start, self.sensors, output, field_, self.quiet_field, self.logged, self.units, self.run,
-            self.segment, self.position, self.attitude, tuple(lines), self.waveform,
+            self.segment, self.position, self.attitude, tuple(lines), self.waveform, courses=self.courses,
         )  # fmt: skip
 
 
