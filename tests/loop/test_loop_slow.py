@@ -94,6 +94,7 @@ def test_slow_noise_of_a_turning_sensor_is_not_mistaken_for_a_slow_effect(single
     assert np.mean(explained["turned"]) < (9.0 if single else 6.0)
 
 
+SECONDS = np.arange(3600) / 2.0
 BENDS = 1e-4  # degC a sample^2, white: an integrated random walk
 
 
@@ -107,7 +108,7 @@ def heated(rng: np.random.Generator, samples: int) -> Array:
 def test_a_thermometer_without_the_noise_of_its_log(noise: float) -> None:
     rng = np.random.default_rng(8)
     true = heated(rng, 3600)
-    error = smoothed(true + noise * rng.standard_normal(3600)) - true
+    error = smoothed(SECONDS, true + noise * rng.standard_normal(3600)) - true
     # the best that is possible, knowing noise and bends: noise^2 times the mean of 1 / (1 + (noise / BENDS)^2 w^4) over
     # all frequencies w, which is (BENDS / noise)^(1/2) / 8^(1/2)
     best = noise * np.sqrt(np.sqrt(BENDS / noise) / np.sqrt(8.0))
@@ -116,16 +117,31 @@ def test_a_thermometer_without_the_noise_of_its_log(noise: float) -> None:
     assert np.std(np.diff(error)) < 0.05 * noise  # what a rate of change is made of
 
 
+def test_a_thermometer_may_go_anywhere_over_a_pause() -> None:
+    rng = np.random.default_rng(10)
+    true = heated(rng, 3600)
+    before, after = np.arange(3600) < 1000, np.arange(3600) >= 2200
+    used = before | after
+    logged = true[used] + np.where(before, 0.0, 3.0)[used] + 0.02 * rng.standard_normal(used.sum())
+
+    error = smoothed(SECONDS[used], logged) - true[used] - np.where(before, 0.0, 3.0)[used]
+
+    best = 0.02 * np.sqrt(np.sqrt(BENDS / 0.02) / np.sqrt(8.0))  # as above
+    assert np.std(error[940:1060]) < 3.0 * best
+
+
 def test_a_log_without_noise_or_without_a_signal_is_used_as_it_is() -> None:
     rng = np.random.default_rng(9)
     true = heated(rng, 3600)
-    np.testing.assert_allclose(smoothed(true), true, atol=1e-4 * np.ptp(true))
+    np.testing.assert_allclose(smoothed(SECONDS, true), true, atol=1e-4 * np.ptp(true))
     line = np.linspace(20.0, 25.0, 60_000)
-    np.testing.assert_allclose(smoothed(line), line, atol=1e-6)  # the stiffest course of all, far from rounding
+    np.testing.assert_allclose(
+        smoothed(np.arange(60_000.0), line), line, atol=1e-6
+    )  # the stiffest course of all, far from rounding
     rough = rng.standard_normal(4000)  # nothing slow in it: what is logged may be what there is
-    np.testing.assert_array_equal(smoothed(rough), rough)
+    np.testing.assert_array_equal(smoothed(np.arange(4000.0), rough), rough)
     rounded = np.round(true, 1)  # held in steps: no noise that second differences would show
-    np.testing.assert_array_equal(smoothed(rounded), rounded)
+    np.testing.assert_array_equal(smoothed(SECONDS, rounded), rounded)
 
 
 def two_unlike(seed: int, *effects: dict[str, Any]) -> dict[str, Any]:

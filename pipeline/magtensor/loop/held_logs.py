@@ -21,9 +21,9 @@ def unheld(time: Array, values: Array) -> Array:
     """
     changed = np.flatnonzero(np.diff(values, prepend=np.nan) != 0)
     if len(changed) < LEAST_READINGS or len(values) < LEAST_HELD * len(changed):
-        return smoothed(values)
+        return smoothed(time, values)
     readings, interval = values[changed], np.diff(time[changed])
     usual = float(np.median(interval))
     if np.mean(np.abs(interval - usual) < usual / 3.0) >= REGULAR:
-        readings = smoothed(readings)
+        readings = smoothed(time[changed], readings)
     return np.interp(time, time[changed], readings)

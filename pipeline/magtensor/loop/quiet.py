@@ -1,4 +1,4 @@
-"""Logged series without their own white noise: a Wiener filter in the cosine transform."""
+"""A base station's field without its own white noise: a Wiener filter in the cosine transform."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def quieted(values: Array, clearance: float) -> Array:
         return np.full(n, values.mean())
     trend = np.polynomial.Polynomial.fit(np.arange(n), values, 1)(np.arange(n))
     coefficients = dct(values - trend, norm="ortho")
-    power, noise = coefficients**2, white_noise(values)
+    power, noise = coefficients**2, white_variance(values)
     if noise <= 0:
         return values
     width = max(n // 100, 5)
@@ -38,7 +38,7 @@ def quieted(values: Array, clearance: float) -> Array:
     return out
 
 
-def white_noise(values: Array) -> float:
+def white_variance(values: Array) -> float:
     """Variance of the white noise of a series (N,): that of second differences, and no more than the power where the
     spectrum is lowest, so that what is rough by itself is not taken for noise."""
     from scipy.fft import dct
