@@ -41,6 +41,24 @@ def test_steps_of_resolution_are_smoothed_and_a_dense_log_is_left() -> None:
     np.testing.assert_array_equal(unheld(TIME, np.zeros(3000)), 0.0)
 
 
+def test_what_goes_on_between_regular_readings_is_not_rounded_off() -> None:
+    angular = 2.0 * np.pi / 300.0  # read ten times a period
+    true = np.sin(angular * TIME)
+    held = true[np.arange(len(TIME)) // HELD * HELD]
+    inside = slice(2 * HELD, len(TIME) - 3 * HELD)
+    straight = (angular * 30.0) ** 2 / np.sqrt(
+        240.0
+    )  # rms error of straight lines: h^2 f'' (s - s^2) / 2, s even in 0..1
+    assert np.std((unheld(TIME, held) - true)[inside]) < 0.15 * straight
+
+
+def test_a_rounded_log_that_flickers_does_not_swing() -> None:
+    rng = np.random.default_rng(4)
+    flickering = np.round((course(TIME) + 0.01 * rng.standard_normal(len(TIME))) / 0.25) * 0.25
+    found = unheld(TIME, flickering)
+    assert found.min() >= flickering.min() - 0.01 and found.max() <= flickering.max() + 0.01
+
+
 @pytest.mark.parametrize("held", [False, True])
 def test_a_temperature_offset_keeps_its_lag_and_needs_no_helper(held: bool, tmp_path: Path) -> None:
     def hold(path: Path) -> None:

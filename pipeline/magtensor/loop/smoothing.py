@@ -18,11 +18,11 @@ def smoothed(time: Array, values: Array) -> Array:
 
     Penalised second differences (Whittaker 1923), which unlike a filter have no edges: at the beginning, where what was
     switched on warms up fastest, the course goes on as it comes, and over a pause it may go where it likes. The penalty
-    is the one with the least unbiased estimate of the error (Mallows 1973), the noise being that of second differences.
-    A regressor made of a noisy log is attenuated, the more the faster what it is asked about, and a lag that it does
-    not have seems to suit it, because a lag smooths.
+    is the one that predicts left-out values best (generalised cross-validation, Craven and Wahba 1979), so that a log
+    that is read too seldom to show its noise is hardly smoothed. A regressor made of a noisy log is attenuated, the
+    more the faster what it is asked about, and a lag that it does not have seems to suit it, because a lag smooths.
 
-    A series with more noise than signal is given back as it is: what is logged may be what there is.
+    A series with much noise for its signal is given back as it is: what is logged may be what there is.
     """
     if len(values) < LEAST_SAMPLES:
         return values
@@ -32,17 +32,17 @@ def smoothed(time: Array, values: Array) -> Array:
         return values
     step = np.diff(time)
     step = np.maximum(step / np.median(step), SHORTEST)
-    best = _stiffness(step[: ENOUGH - 1], values[:ENOUGH] - mean, noise)
+    best = _stiffness(step[: ENOUGH - 1], values[:ENOUGH] - mean)
     return _course(step, values - mean, best) + mean
 
 
-def _stiffness(step: Array, values: Array, noise: float) -> float:
+def _stiffness(step: Array, values: Array) -> float:
     """The decimal power of the best penalty, to a half."""
     eigenvalues = (2.0 - 2.0 * np.cos(np.pi * np.arange(len(values)) / len(values))) ** 2
 
     def risk(power: float) -> float:
-        kept = np.mean(1.0 / (1.0 + 10.0**power * eigenvalues))
-        return float(np.mean((_course(step, values, power) - values) ** 2) + 2.0 * noise * kept)
+        kept = np.mean(1.0 / (1.0 + 10.0**power * eigenvalues))  # of the values' freedom
+        return float(np.mean((_course(step, values, power) - values) ** 2) / (1.0 - kept) ** 2)
 
     best = min(np.arange(-1.0, STIFFEST + 1.0), key=risk)
     return float(min((best - 0.5, best, best + 0.5), key=risk))
