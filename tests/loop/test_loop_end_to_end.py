@@ -101,7 +101,7 @@ def test_an_undeclared_effect_is_found_and_nothing_else(
 def test_a_delay_is_found_between_sensors_and_none_common_to_all(tmp_path: Path) -> None:
     """DESIGN 3: a common delay is a turn of the field, which nobody measured."""
     late = {"type": "sampling_lag", "lag_s": [[2e-3] * 3, [0.0] * 3, [0.0] * 3, [0.0] * 3]}
-    found = verdict_of(tmp_path, scenario(5, late))
+    found = verdict_of(tmp_path, scenario(5, late), models=lasting_effects())
     assert adopted_names(found) == {"sampling_lag"}
     lag = {c["sensor"]: c["value"] for c in found["adopted"][0]["coefficients"]}
     for sensor in ("S2", "S3", "S4"):
@@ -120,6 +120,7 @@ def test_two_effects_at_once(tmp_path: Path) -> None:
     assert not found["unexplained"]["present"]
 
 
+BESIDE_A_SOURCE = ("latent_source", "offset_step", "offset_drift", "temperature_offset", "current_field")
 VECTORS = [[0.9, -0.4, 0.6], [-0.5, 0.8, 0.1], [0.2, 0.5, -0.9], [0.7, -0.6, 0.3]]
 
 
@@ -137,7 +138,8 @@ def test_a_source_that_nobody_logged_is_found_and_taken_off_another_survey(tmp_p
         if name == "told":
             surveys = [s | {"channels": s["channels"] | {"hidden": SLOW}} for s in surveys]
         survey, verify = (survey_file(tmp_path, s, f"{name}_{i}.h5") for i, s in enumerate(surveys))
-        run_recipe(path, tmp_path / name, survey=survey, verify=verify)
+        few = [f"stages.close_loop.search=[{', '.join(BESIDE_A_SOURCE)}]"] if name == "found" else []
+        run_recipe(path, tmp_path / name, survey=survey, verify=verify, overrides=few)
         outcome[name] = json.loads((tmp_path / name / "verdict.json").read_text())
     found = outcome["found"]
     require_contract(found)
@@ -157,8 +159,7 @@ def require_latent_source_alone(found: Verdict) -> None:
 def test_a_source_that_nobody_logged_and_that_switches_is_no_step(tmp_path: Path) -> None:
     switched = {"type": "switched", "levels": [-1.0, 1.0], "mean_hold_s": 70.0}
     unlogged = {"type": "latent_source", "nT_per_unit": VECTORS, "waveform_of": switched}
-    models = ("latent_source", "offset_step", "offset_drift", "temperature_offset", "current_field")
-    require_latent_source_alone(verdict_of(tmp_path, scenario(8, unlogged), models=models))
+    require_latent_source_alone(verdict_of(tmp_path, scenario(8, unlogged), models=BESIDE_A_SOURCE))
 
 
 @pytest.mark.parametrize("array", [ONE_SENSOR, TWO_SENSORS])
@@ -166,7 +167,8 @@ def test_a_source_that_nobody_logged_and_that_switches_is_no_step(tmp_path: Path
 def test_few_sensors(tmp_path: Path, array: dict[str, Any], rms_nT: float | None) -> None:
     instrument = scenario()["instrument"] | {"array": array}
     effects = () if rms_nT is None else ({"type": "current_field", "rms_nT": rms_nT, "channel": "current_heater"},)
-    found = verdict_of(tmp_path, scenario(4, *effects, instrument=instrument))
+    models = lasting_effects() if effects else None
+    found = verdict_of(tmp_path, scenario(4, *effects, instrument=instrument), models=models)
     require_contract(found)
     assert found["error"]["held_out"]["after"]["tensor_rms_nT_per_m"] is None
     assert adopted_names(found) == ({"current_field"} if effects else set())
@@ -179,7 +181,8 @@ def test_limited_tilt(tmp_path: Path, effect: dict[str, Any] | None) -> None:
         "type": "limited_tilt", "duration_s": 1800.0, "tilt_deg": 20.0, "tilt_time_s": 6.0,
         "yaw_rate_rms_deg_s": 15.0, "yaw_time_s": 30.0,
     }  # fmt: skip
-    found = verdict_of(tmp_path, scenario(5, *([effect] if effect else []), motion=motion))
+    models = lasting_effects() if effect else None
+    found = verdict_of(tmp_path, scenario(5, *([effect] if effect else []), motion=motion), models=models)
     require_contract(found)
     if effect is None:
         assert found["adopted"] == [] and not found["unexplained"]["present"]
@@ -190,7 +193,7 @@ def test_limited_tilt(tmp_path: Path, effect: dict[str, Any] | None) -> None:
 @pytest.mark.parametrize("effect", [None, {"type": "temperature_offset", "rms_nT": 3.0, "lag_s": 100.0}])
 def test_static_postures(tmp_path: Path, effect: dict[str, Any] | None) -> None:
     description = yaml.safe_load(POSTURES.read_text()) | {"rate_Hz": 2.0, "effects": [effect] if effect else []}
-    found = verdict_of(tmp_path, description)
+    found = verdict_of(tmp_path, description, models=lasting_effects() if effect else None)
     require_contract(found)
     assert suspects(found) >= ({"temperature_offset"} if effect else set())
     if effect is None:
