@@ -37,11 +37,15 @@ def into_platform(attitude: Array, world: Array) -> Array:
     return out
 
 
-def seen_from_world(quaternions: Array, direction: Array) -> Array:
+def to_world(attitude: Array) -> Array:
+    """(N, 3, 3): the rotation from the platform into the world; row k is the world's axis k in the platform frame."""
+    return np.stack([into_platform(attitude, axis) for axis in np.eye(3)], axis=1)
+
+
+def seen_from_world(turns: Array, direction: Array) -> Array:
     """(3, 3, 3): with a rotation Q (j, a) of directions (N, 3) into the platform frame, einsum("ija,ja->i") of it is
-    the mean direction in the world."""
-    to_world = np.stack([into_platform(quaternions, axis) for axis in np.eye(3)], axis=1)
-    out: Array = np.einsum("nij,na->ija", to_world, direction) / len(direction)
+    the mean direction in the world. `turns` (N, 3, 3) as of `to_world`."""
+    out: Array = np.einsum("nij,na->ija", turns, direction) / len(direction)
     return out
 
 
@@ -89,8 +93,8 @@ def into_platform_frame(quaternions: Array, field: Array) -> Array:
     use = np.isfinite(quaternions).all(axis=1) & np.isfinite(field).all(axis=1)
     if not use.any():
         return np.eye(3)
-    q, direction = quaternions[use], field[use] / np.linalg.norm(field[use], axis=1, keepdims=True)
-    mean = seen_from_world(q, direction)
+    turns, direction = to_world(quaternions[use]), field[use] / np.linalg.norm(field[use], axis=1, keepdims=True)
+    mean = seen_from_world(turns, direction)
     parallel, *others = right_angled()
     length, found = longest(mean, parallel, mirrored=False)
     left = max(1.0 - length**2, 0.0)
@@ -99,15 +103,14 @@ def into_platform_frame(quaternions: Array, field: Array) -> Array:
         if FAR_BETTER**2 * max(1.0 - length**2, 0.0) < left:
             left, found = max(1.0 - length**2, 0.0), best
     mounted = max(right_angled(), key=lambda axes: float(np.sum(axes * found)))
-    shown = _shown(q, direction @ found.T)
+    shown = _shown(turns, direction @ found.T)
     believed = np.linalg.solve(shown + left / MOUNTED**2 * np.eye(3), shown @ to_vector(found @ mounted.T))
     return from_vector(np.asarray(believed, dtype=np.float64)) @ mounted
 
 
-def _shown(quaternions: Array, direction: Array) -> Array:
+def _shown(turns: Array, direction: Array) -> Array:
     """(3, 3): mean square by which directions in the world move for a turn of directions (N, 3) by one radian."""
-    to_world = np.stack([into_platform(quaternions, axis) for axis in np.eye(3)], axis=1)
-    moved = np.cross(to_world, direction[:, None])
+    moved = np.cross(turns, direction[:, None])
     moved -= moved.mean(axis=0)
     out: Array = np.einsum("nij,nik->jk", moved, moved) / len(moved)
     return out

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from magtensor.attitude import FAR_BETTER, longest, right_angled, seen_from_world
+from magtensor.attitude import FAR_BETTER, longest, right_angled, seen_from_world, to_world
 from magtensor.calibration.types import Array
 from magtensor.errors import DataError
 from magtensor.frame.attitude import LEAST_SAMPLES, WORST_MISFIT
@@ -68,7 +68,7 @@ def require_following(quaternions: Array, b: Array, world: Array | None) -> None
 def misfit(quaternions: Array, direction: Array, world: Array | None) -> float:
     """rad rms, what the best rotation of directions (N, 3) leaves; a mirror counts as a rotation, as of an array whose
     axes are all inverted, which is another mistake."""
-    mean = seen_from_world(quaternions, direction)
+    mean = seen_from_world(to_world(quaternions), direction)
     if world is not None:
         together = float(np.linalg.svd(np.einsum("i,ija->ja", world, mean), compute_uv=False).sum())
         return float(np.sqrt(max(2.0 - 2.0 * together, 0.0)))

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from magtensor.attitude import into_platform
+from magtensor.attitude import to_world
 from magtensor.calibrated import B, contrasts, stored
 from magtensor.calibration.noise import noise_std
 from magtensor.calibration.types import Array, ArrayCalibration
@@ -219,11 +219,11 @@ def _read(
     if name == "attitude":
         if "attitude" not in survey:
             raise NotEnoughData("the survey has no attitude")
-        to_world = np.stack([into_platform(survey.values("attitude"), axis) for axis in np.eye(3)], axis=1)
-        use &= np.isfinite(to_world).all(axis=(1, 2))
+        turns = to_world(survey.values("attitude"))
+        use &= np.isfinite(turns).all(axis=(1, 2))
         world = survey.values("reference/world_field") if "reference/world_field" in survey else None
         require_following(survey.values("attitude")[use], b[use].mean(axis=1), world)
-        return [attitude(b[use], to_world[use], errors, world)]
+        return [attitude(b[use], turns[use], errors, world)]
     if name == "axis":
         if not declared.turns:
             raise DataError("no turns are declared", hint="give `turns`, e.g. {z: [3]} for segment 3 about z")

@@ -135,9 +135,8 @@ def test_a_log_without_noise_or_without_a_signal_is_used_as_it_is() -> None:
     true = heated(rng, 3600)
     np.testing.assert_allclose(smoothed(SECONDS, true), true, atol=1e-4 * np.ptp(true))
     line = np.linspace(20.0, 25.0, 60_000)
-    np.testing.assert_allclose(
-        smoothed(np.arange(60_000.0), line), line, atol=1e-6
-    )  # the stiffest course of all, far from rounding
+    stiffest = smoothed(np.arange(60_000.0), line)
+    np.testing.assert_allclose(stiffest, line, atol=1e-6)  # and far from rounding
     rough = rng.standard_normal(4000)  # nothing slow in it: what is logged may be what there is
     np.testing.assert_array_equal(smoothed(np.arange(4000.0), rough), rough)
     rounded = np.round(true, 1)  # held in steps: no noise that second differences would show

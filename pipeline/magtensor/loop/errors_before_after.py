@@ -26,7 +26,7 @@ def folds_for(state: State) -> NDArray[np.int_]:
 
     Folds of equal length. Where two neighbours hold nearly all that can be known of a model, they are divided into as
     many that know equally much: one part of a vehicle's passing is predicted by its other parts, and by nothing else.
-    What is known follows from the regressors, not from the data.
+    What is known follows from the regressors; their settings, as everywhere in these folds, were found on all samples.
     """
     n = len(state.excitation.time)
     edges = np.linspace(0, n, FOLDS + 1).round().astype(int)

@@ -12,7 +12,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from magtensor.attitude import into_platform, into_platform_frame
+from magtensor.attitude import into_platform_frame, to_world
 from magtensor.calibration.types import Array
 from magtensor.errors import did_you_mean
 from magtensor.loop.held_logs import unheld
@@ -180,8 +180,7 @@ class Excitation:
         """
         if self.attitude is None:
             raise KeyError("the survey has no attitude")
-        attitude = self.attitude
-        return np.stack([into_platform(attitude, axis) for axis in np.eye(3)], axis=1)
+        return to_world(self.attitude)
 
     @cached_property
     def from_platform(self) -> Array:

@@ -21,14 +21,14 @@ def quieted(values: Array, clearance: float) -> Array:
     ----------
     clearance: frequencies with less than so many times the noise power are left out altogether.
     """
-    from scipy.fft import dct, idct
+    from scipy.fft import idct
 
     n = len(values)
     if n < LEAST_SAMPLES:
         return np.full(n, values.mean())
-    trend = np.polynomial.Polynomial.fit(np.arange(n), values, 1)(np.arange(n))
-    coefficients = dct(values - trend, norm="ortho")
-    power, noise = coefficients**2, white_variance(values)
+    trend, coefficients = _spectrum(values)
+    power = coefficients**2
+    noise = _white(values, power)
     if noise <= 0:
         return values
     width = max(n // 100, 5)
@@ -41,12 +41,20 @@ def quieted(values: Array, clearance: float) -> Array:
 def white_variance(values: Array) -> float:
     """Variance of the white noise of a series (N,): that of second differences, and no more than the power where the
     spectrum is lowest, so that what is rough by itself is not taken for noise."""
+    return _white(values, _spectrum(values)[1] ** 2)
+
+
+def _spectrum(values: Array) -> tuple[Array, Array]:
+    """A straight trend (N,), and the cosine transform (N,) of what is left."""
     from scipy.fft import dct
 
-    n = len(values)
-    trend = np.polynomial.Polynomial.fit(np.arange(n), values, 1)(np.arange(n))
-    power = dct(values - trend, norm="ortho") ** 2
-    bands = int(np.clip(n // LEAST_IN_A_BAND, 1, BANDS))
+    at = np.arange(len(values))
+    trend: Array = np.polynomial.Polynomial.fit(at, values, 1)(at)
+    return trend, dct(values - trend, norm="ortho")
+
+
+def _white(values: Array, power: Array) -> float:
+    bands = int(np.clip(len(values) // LEAST_IN_A_BAND, 1, BANDS))
     lowest = min(float(band.mean()) for band in np.array_split(power, bands))
     second = np.diff(values, n=2)
     return min(float(np.median(np.abs(second)) * MAD_TO_SIGMA) ** 2 / 6.0, lowest)
