@@ -23,8 +23,8 @@ from magtensor.calibration.surveys.corrections import SurveysCalibration
 from magtensor.calibration.surveys.covariance import to_corrections, with_offset
 from magtensor.calibration.surveys.fit import frame_of
 from magtensor.calibration.types import Array, ArrayCalibration
+from magtensor.loop.columns import across_directions, along_the_field
 from magtensor.loop.correction import TONE
-from magtensor.loop.evidence import across_directions, along_the_field
 from magtensor.loop.model import Adopted, State
 from magtensor.loop.record import record_of
 from magtensor.loop.residual import Residual
@@ -159,11 +159,10 @@ def _slope(residual: Residual, terms: Terms, plane: CommonField, forward: Array,
     turned = forward @ q
     sensors, size = len(forward), 3 * len(forward)
     across, inner = np.linalg.pinv(residual.affine), residual.inner
-    columns = along_the_field(residual, terms)
-    seen = columns.base @ columns.mix
+    seen = along_the_field(residual, [terms]).made
     if residual.sighted is not None:
         inner = np.concatenate([inner, residual.sighted.inner])
-        seen = np.concatenate([seen, across_directions(residual, terms)])
+        seen = np.concatenate([seen, across_directions(residual, [terms]).made])
     inside = np.linalg.lstsq(inner, seen, rcond=_INNER_RANK)[0]
     at = with_offset(sensors, np.ones(1))[:, : 9 * sensors]
     to_frame = np.eye(9 * sensors) if tied else at.T @ frame_projection(turned) @ at

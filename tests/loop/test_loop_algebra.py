@@ -10,11 +10,13 @@ from loop_cases import Array, synthetic
 
 from magtensor.calibration.joint import fit_joint
 from magtensor.components import component_of, error_model
+from magtensor.loop.assessment import Colours, colours_of, estimated, explained
 from magtensor.loop.colour import Colour
 from magtensor.loop.evidence import grams, held_out, normal
 from magtensor.loop.excitation import Excitation
 from magtensor.loop.model import Fitting, Record, excitation_of
 from magtensor.loop.residual import Residual, residual_of, taken_off
+from magtensor.loop.scoring import Scorer, rarity
 from magtensor.loop.search import search
 from magtensor.loop.statistics import own_information, solve
 from magtensor.loop.terms import REFERENCE, Terms, joined
@@ -207,3 +209,25 @@ def test_an_error_model_that_gives_no_terms_is_told_and_in_nobodys_way() -> None
     assert component is not None
     found = search(synthetic(3, samples=200), [component], Fitting())
     assert "gives ndarray" in found.failed["shapeless"] and not found.last.adopted
+
+
+def test_sets_of_terms_are_scored_together_as_each_is_alone() -> None:
+    """Whatever is in already, and in noise of any colour: by the explained sum of squares of a fit to each."""
+    record = synthetic(9, samples=300, sensors=3)
+    fit = fit_joint(record.raw, record.total_field, noise=np.ones((3, 3)))
+    residual, x = residual_of(fit, record.raw, record.total_field), excitation_of(record, fit)
+    t = np.linspace(-1.0, 1.0, 300)
+    given = x.offsets(t**3, "nT")
+    several = [
+        joined([x.offsets(np.sin(w * t), "nT"), x.matrices(1e-4 * np.cos(w * t)[:, None] * x.field[:, 0], "1")])
+        for w in (3.0, 5.0, 7.0)
+    ]
+    assert several[0].like(several[2]) and not several[0].like(given)
+    for adopted in (None, given):
+        for colours in (Colours(WHITE, WHITE), colours_of(residual)):
+            score = Scorer(residual, adopted, colours)
+            for terms, found in zip(several, score.of_each(several), strict=True):
+                every = [terms] if adopted is None else [adopted, terms]
+                estimate = estimated(residual, joined(every), colours)
+                beyond = explained(estimate) - score.own
+                assert found == pytest.approx(rarity(beyond, min(estimate.rank, terms.count)), rel=1e-6)

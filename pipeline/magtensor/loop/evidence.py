@@ -8,20 +8,20 @@ serves every output. Along the field the regressors are products with the gain, 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from functools import cached_property
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from magtensor.calibration.types import Array
 from magtensor.loop.colour import Colour
+from magtensor.loop.columns import Columns, across_directions, along_the_field, series_of_each
 from magtensor.loop.residual import Residual
 from magtensor.loop.terms import REFERENCE, Terms, joined
 from magtensor.loop.turned import TurnedColour
 
-IDENTIFIABLE = 1e-6  # of a regressor's own information: less than this is left after the fit's own freedom
 _INNER_RANK = 1e-9
 
 
@@ -88,14 +88,6 @@ class Grams:
 
 
 @dataclass(frozen=True)
-class Columns:
-    """Columns of P terms along the field, base @ mix, of few that are worked on: base (N, Q), mix (Q, P)."""
-
-    base: Array
-    mix: Array
-
-
-@dataclass(frozen=True)
 class Whitened:
     """A residual, the fit's own freedom and the models already in it, in noise made white: what new terms are added to.
 
@@ -106,6 +98,7 @@ class Whitened:
             for a single sensor.
         known_along: (N, 3 A + P + 1) the fit's own freedom, the columns of the given terms and the residual along; None
             without a total field.
+        known_sighted: (2 N, 3 A + P + 1) the same of known directions, None without; they are white already.
         over_time: whether the rows are samples; where only sums over all of them are asked for they need not be.
     """
 
@@ -115,6 +108,7 @@ class Whitened:
     given: Terms | None
     known_across: Array | None
     known_along: Array | None
+    known_sighted: Array | None
     over_time: bool = True
 
     @classmethod
@@ -127,42 +121,43 @@ class Whitened:
         *,
         over_time: bool = True,
     ) -> Whitened:
-        known_across = known_along = None
+        known_across = known_along = known_sighted = None
         if residual.across is not None:
             series = [] if given is None else [given.series * _seen_across(given)]
             known = np.hstack([residual.affine, *series, residual.across])
             known_across = across.whiten(known, back=over_time)
         if residual.along is not None:
-            columns = [] if given is None else [_made(along_the_field(residual, given))]
+            columns = [] if given is None else [along_the_field(residual, [given]).made]
             known = np.hstack([residual.inner, *columns, residual.along[:, None]])
             known_along = along.whiten(known, back=over_time)
-        return cls(residual, across, along, given, known_across, known_along, over_time)
+        if residual.sighted is not None:
+            columns = [] if given is None else [across_directions(residual, [given]).made]
+            known_sighted = np.hstack([residual.sighted.inner, *columns, residual.sighted.residual[:, None]])
+        return cls(residual, across, along, given, known_across, known_along, known_sighted, over_time)
 
     @cached_property
-    def _sums(self) -> dict[int, tuple[Array | None, Array | None]]:
+    def _sums(self) -> dict[int, tuple[Array | None, Array | None, Array | None]]:
         return {}
 
-    def sums(self, blocks: int) -> tuple[Array | None, Array | None]:
-        """(B, ., .) products of all that is known across with each other, and of all that is known along."""
+    def sums(self, blocks: int) -> tuple[Array | None, Array | None, Array | None]:
+        """(B, ., .) products of all that is known across with each other, of all that is along, and sighted."""
         if blocks not in self._sums:
-            known = self.known_across, self.known_along
-            first, second = (None if k is None else _products(k, k, self.edges(blocks)) for k in known)
-            self._sums[blocks] = first, second
+            across, along, sighted = (
+                None if k is None else _products(k, k, self.edges(blocks, len(k)))
+                for k in (self.known_across, self.known_along, self.known_sighted)
+            )
+            self._sums[blocks] = across, along, sighted
         return self._sums[blocks]
 
-    def edges(self, blocks: int) -> NDArray[np.int_]:
-        """(B + 1,) where blocks begin and end."""
+    def edges(self, blocks: int, rows: int | None = None) -> NDArray[np.int_]:
+        """(B + 1,) where blocks begin and end, in samples or in so many rows, as many of each sample."""
         assert self.over_time or blocks == 1
-        return np.linspace(0, len(self.residual.affine), blocks + 1).round().astype(int)
+        count = len(self.residual.affine)
+        return np.linspace(0, count, blocks + 1).round().astype(int) * ((rows or count) // count)
 
 
 def _seen_across(terms: Terms) -> float:
     return 1.0 if (terms.part_output != REFERENCE).any() else 0.0
-
-
-def _made(columns: Columns) -> Array:
-    out: Array = columns.base @ columns.mix
-    return out
 
 
 def _products(a: Array, b: Array, edges: NDArray[np.int_]) -> Array:
@@ -181,83 +176,92 @@ def grams(residual: Residual, terms: Terms, across: Colour, along: Colour | Turn
     return grams_in(Whitened.of(residual, across, along), terms, blocks)
 
 
+_Sums = Callable[[Array, Array], tuple[Array, Array]]
+
+
 def grams_in(white: Whitened, terms: Terms | None, blocks: int = 1) -> Grams:
     """The same of the terms that are in a whitened residual already, and of more where there are any."""
-    residual, given, edges = white.residual, white.given, white.edges(blocks)
-    together = joined([t for t in (given, terms) if t is not None])
+
+    def sums(known: Array, new: Array) -> tuple[Array, Array]:
+        edges = white.edges(blocks, len(new))
+        return _products(known, new, edges), _products(new, new, edges)
+
+    samples = np.diff(white.edges(blocks)).astype(float)
+    return _grams(white, [] if terms is None else [terms], sums, white.sums(blocks), samples)
+
+
+def grams_of_each(white: Whitened, several: Sequence[Terms]) -> Grams:
+    """The same over all samples of each of several sets of terms, one in the place of each block; only in their series
+    do they differ."""
+    count = len(several)
+
+    def sums(known: Array, new: Array) -> tuple[Array, Array]:
+        each = np.ascontiguousarray(new.T).reshape(count, -1, len(new))
+        return (each @ known).swapaxes(1, 2), each @ each.swapaxes(1, 2)
+
+    across, along, sighted = (None if s is None else s.repeat(count, axis=0) for s in white.sums(1))
+    samples = np.full(count, float(len(white.residual.affine)))
+    return _grams(white, several, sums, (across, along, sighted), samples)
+
+
+def _grams(
+    white: Whitened,
+    several: Sequence[Terms],
+    sums: _Sums,
+    known: tuple[Array | None, Array | None, Array | None],
+    samples: Array,
+) -> Grams:
+    """Gram matrices of what is in a whitened residual and of sets of new terms.
+
+    Parameters
+    ----------
+    several: the sets, or none; sums: of what is known and new, and of what is new.
+    known: products of what is known (B, ., .), across, along and sighted; samples: (B,).
+    """
+    residual, given, batch = white.residual, white.given, len(samples)
+    together = joined([t.at(np.arange(0)) for t in (given, *several[:1]) if t is not None])  # without their series
     own, size = residual.affine.shape[1], len(residual.noise)
     k, p = together.series.shape[1], together.count
-    zz, zd, dd = np.zeros((blocks, own, own)), np.zeros((blocks, own, k)), np.zeros((blocks, k, k))
-    ze, de, ee = np.zeros((blocks, own, size)), np.zeros((blocks, k, size)), np.zeros(blocks)
-    aa, ar, rr = np.zeros((blocks, 3 * own + p, 3 * own + p)), np.zeros((blocks, 3 * own + p)), np.zeros(blocks)
-    across, along = white.sums(blocks)
+    zz, zd, dd = np.zeros((batch, own, own)), np.zeros((batch, own, k)), np.zeros((batch, k, k))
+    ze, de, ee = np.zeros((batch, own, size)), np.zeros((batch, k, size)), np.zeros(batch)
+    aa, ar, rr = np.zeros((batch, 3 * own + p, 3 * own + p)), np.zeros((batch, 3 * own + p)), np.zeros(batch)
+    across, along, sighted = known
     if across is not None and white.known_across is not None:
         m = across.shape[1] - size  # z and the series of the given terms
         zz, ze, ee = across[:, :own, :own], across[:, :own, m:], np.trace(across[:, m:, m:], axis1=1, axis2=2)
         zd[:, :, : m - own], dd[:, : m - own, : m - own] = across[:, :own, own:m], across[:, own:m, own:m]
         de[:, : m - own] = across[:, own:m, m:]
-        if terms is not None and _seen_across(terms):
-            d = white.across.whiten(terms.series, back=white.over_time)
-            new, seen = slice(m - own, None), _products(white.known_across, d, edges)
+        if several and _seen_across(several[0]):
+            series = series_of_each(several)
+            new = slice(m - own, None)
+            d = white.across.whiten(series.reshape(-1, series.shape[2]).T, back=white.over_time)
+            seen, dd[:, new, new] = sums(white.known_across, d)
             zd[:, :, new], de[:, new] = seen[:, :own], seen[:, m:].swapaxes(1, 2)
             dd[:, : m - own, new], dd[:, new, : m - own] = seen[:, own:m], seen[:, own:m].swapaxes(1, 2)
-            dd[:, new, new] = _products(d, d, edges)
+
+    def add(products: Array, known: Array, columns: Columns | None, whiten: Callable[[Array], Array]) -> None:
+        m = products.shape[1] - 1  # the fit's own freedom and the columns of the given terms
+        aa[:, :m, :m] += products[:, :m, :m]
+        ar[:, :m] += products[:, :m, m]
+        rr[:] += products[:, m, m]
+        if columns is not None:
+            mix = columns.mix
+            seen, new = sums(known, whiten(columns.base))
+            seen = seen @ mix
+            aa[:, :m, m:] += seen[:, :m]
+            aa[:, m:, :m] += seen[:, :m].swapaxes(1, 2)
+            ar[:, m:] += seen[:, m]
+            aa[:, m:, m:] += mix.T @ new @ mix
+
     if along is not None and white.known_along is not None:
-        m = along.shape[1] - 1  # the fit's own freedom and the columns of the given terms
-        aa[:, :m, :m], ar[:, :m], rr = along[:, :m, :m], along[:, :m, m], along[:, m, m]
-        if terms is not None:
-            columns = along_the_field(residual, terms)
-            base, mix = white.along.whiten(columns.base, back=white.over_time), columns.mix
-            seen = _products(white.known_along, base, edges) @ mix
-            aa[:, :m, m:], aa[:, m:, :m], ar[:, m:] = seen[:, :m], seen[:, :m].swapaxes(1, 2), seen[:, m]
-            aa[:, m:, m:] = mix.T @ _products(base, base, edges) @ mix
-    if residual.sighted is not None:
-        every = np.hstack([residual.sighted.inner, across_directions(residual, together)])
-        off = residual.sighted.residual
-        aa, ar = aa + _products(every, every, 2 * edges), ar + _products(every, off[:, None], 2 * edges)[:, :, 0]
-        rr = rr + _products(off[:, None], off[:, None], 2 * edges)[:, 0, 0]
+        columns = along_the_field(residual, several) if several else None
+        add(along, white.known_along, columns, partial(white.along.whiten, back=white.over_time))
+    if sighted is not None and white.known_sighted is not None:
+        add(sighted, white.known_sighted, across_directions(residual, several) if several else None, lambda c: c)
     return Grams(
-        zz, zd, dd, ze, de, ee, aa, ar, rr, np.diff(edges).astype(float),
+        zz, zd, dd, ze, de, ee, aa, ar, rr, samples,
         together.part_term, together.part_output, together.part_series, p, residual.projector, residual.noise,
     )  # fmt: skip
-
-
-def along_the_field(residual: Residual, terms: Terms) -> Columns:
-    """The terms' columns along the field."""
-    found = _columns(residual, terms, residual.slow_modes.response, residual.shown_along)
-    return found if residual.levels is None else replace(found, base=residual.levels.off(found.base))
-
-
-def across_directions(residual: Residual, terms: Terms) -> Array:
-    """(2 N, P): the terms' columns across known directions."""
-    assert residual.sighted is not None
-    twice = terms.at(np.repeat(np.arange(len(terms.series)), 2))
-    found = _columns(residual, twice, residual.sighted.response, residual.shown_sighted)
-    return found.base @ found.mix
-
-
-def _columns(residual: Residual, terms: Terms, response: Array, shown: Array) -> Columns:
-    """The terms' columns in rows of whitened values.
-
-    The outputs show in each of them through three responses only, so a series that acts on more than three of them has
-    no more columns than three to be worked on.
-    """
-    term, output, series = terms.part_term, terms.part_output, terms.part_series
-    wide = np.bincount(series[output != REFERENCE], minlength=terms.series.shape[1]) > 3
-    own = ~wide[series] | (output == REFERENCE)
-    base = [terms.series[:, series[own]] * shown[:, output[own]]]
-    mix = [np.zeros((int(own.sum()), terms.count))]
-    mix[0][np.arange(len(mix[0])), term[own]] = 1.0
-    if wide.any():
-        size = 3 * int(wide.sum())
-        base.append((terms.series[:, wide, None] * response[:, None, :]).reshape(len(response), size))
-        each = np.zeros((size // 3, 3, terms.count))
-        place = (np.cumsum(wide) - 1)[series[~own]]
-        by_output = residual.basis[output[~own]] / residual.noise[output[~own], None]
-        np.add.at(each, (place[:, None], np.arange(3), term[~own, None]), by_output)
-        mix.append(each.reshape(size, terms.count))
-    found = Columns(np.hstack(base), np.vstack(mix))
-    return found if len(found.mix) <= terms.count else Columns(found.base @ found.mix, np.eye(terms.count))
 
 
 def normal(g: Grams) -> tuple[Array, Array]:

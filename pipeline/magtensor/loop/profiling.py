@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,6 +24,7 @@ from magtensor.loop.terms import Terms, joined
 LEAST_RATIO = 2.0  # of the time constants, lags or widths of a model adopted twice
 SCREENING_SAMPLES = 2000  # settings are profiled on so many samples
 REFINING_SAMPLES = 6000  # and the best of them refined on so many
+BATCH_ENTRIES = 130_000  # numbers in the series that are worked on together
 MOST_OF_IT = 0.75  # of what a model explains, if it is to be made about other settings
 _REFINEMENTS = 8
 
@@ -137,23 +138,38 @@ def best_settings(
     grid = [g for g in settings_grid(model, state.excitation) if not _already(state, model, g)]
     if len(grid) == 1:
         return [(grid[0], 1.0)]
+    tested: list[tuple[dict[str, Any], Terms]] = []
+    for settings in grid:
+        terms = few.terms(model, settings, failed)
+        if terms is not None and terms.count:
+            tested.append((settings, terms))
+    if not tested:
+        return []
     scores: list[tuple[float, float, dict[str, Any]]] = []
     chain: list[float] = []
     last: Array | None = None
-    for settings in grid:
-        terms = few.terms(model, settings, failed)
-        if terms is None or not terms.count:
-            continue
-        scores.append((few.white(terms), few.coloured(terms), settings))
-        series = projected(terms, few.freedom)
-        if last is not None:
-            chain.append(alike(last, series))
-        last = series
-    if not scores:
-        return []
+    for several in _batches([terms for _, terms in tested]):
+        white, coloured = few.white.of_each(several), few.coloured.of_each(several)
+        scores += [(w, c, tested[len(scores) + i][0]) for i, (w, c) in enumerate(zip(white, coloured, strict=True))]
+        for terms in several:
+            series = projected(terms, few.freedom)
+            if last is not None:
+                chain.append(alike(last, series))
+            last = series
     tried = effective_tests(chain, alpha)
     best = max(scores, key=lambda s: s[0])[2], max(scores, key=lambda s: s[1])[2]
     return [(settings, tried) for settings in (best[:1] if best[0] is best[1] else best)]
+
+
+def _batches(terms: Sequence[Terms]) -> Iterator[list[Terms]]:
+    """Neighbouring terms that differ in their series only, not too many at a time."""
+    batch: list[Terms] = []
+    for each in terms:
+        if batch and (len(batch) * each.series.size > BATCH_ENTRIES or not batch[0].like(each)):
+            yield batch
+            batch = []
+        batch.append(each)
+    yield batch
 
 
 def refined(model: Component, settings: dict[str, Any], state: State, failed: dict[str, str]) -> dict[str, Any]:

@@ -121,15 +121,15 @@ class Residual:
 
     @cached_property
     def shown_along(self) -> Array:
-        """(N, 3 S + 1) 1/nT, d along / d raw output, and last d along / d total field."""
-        return np.column_stack([self.gain / self.noise, self.reference_gain])
+        """(3 S + 1, N) 1/nT, d along / d raw output, and last d along / d total field."""
+        return np.vstack([(self.gain / self.noise).T, self.reference_gain])
 
     @cached_property
     def shown_sighted(self) -> Array:
-        """(2 N, 3 S + 1) 1/nT, the same of known directions."""
+        """(3 S + 1, 2 N) 1/nT, the same of known directions."""
         assert self.sighted is not None
         gain = self.sighted.response @ self.basis.T
-        return np.column_stack([gain / self.noise, self.sighted.reference_gain])
+        return np.vstack([(gain / self.noise).T, self.sighted.reference_gain])
 
     @property
     def freedom(self) -> int:

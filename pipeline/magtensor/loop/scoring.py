@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from math import lgamma, log
 
 from magtensor.loop.assessment import Colours, estimated_in, explained
-from magtensor.loop.evidence import Whitened
+from magtensor.loop.evidence import Whitened, grams_of_each
 from magtensor.loop.residual import Residual
+from magtensor.loop.statistics import explained_by_each
 from magtensor.loop.terms import Terms
 
 
@@ -18,8 +20,13 @@ class Scorer:
         self.own = 0.0 if adopted is None else explained(estimated_in(self.white, None))
 
     def __call__(self, terms: Terms) -> float:
-        estimate = estimated_in(self.white, terms)
-        return rarity(explained(estimate) - self.own, max(min(estimate.rank, terms.count), 1))
+        return self.of_each([terms])[0]
+
+    def of_each(self, several: Sequence[Terms]) -> list[float]:
+        """The same of several sets of terms that differ in their series only."""
+        found, ranks = explained_by_each(grams_of_each(self.white, several))
+        most = several[0].count
+        return [rarity(e - self.own, max(min(r, most), 1)) for e, r in zip(found, ranks, strict=True)]
 
 
 def rarity(explained: float, rank: int) -> float:

@@ -67,19 +67,35 @@ def _directions(n: Array, scale: Array) -> tuple[Array, Array]:
 
 def own_information(g: Grams) -> Array:
     """(P,) the information each regressor would have if the fit had no freedom of its own, constants left out."""
-    total = g.total()
-    out = np.zeros(g.count)
+    out: Array = own_information_of_each(g.total())[0]
+    return out
+
+
+def own_information_of_each(g: Grams) -> Array:
+    """(B, P) the same of each block or set."""
+    out = np.zeros((len(g.zz), g.count))
     raw = g.part_output >= 0
     if raw.any() and g.zz.any():
-        dd = np.diagonal(total.dd[0])
-        squares = np.maximum(np.diagonal(total.zz[0])[3:], 1e-300)
-        constant = np.sum(total.zd[0, 3:] ** 2 / squares[:, None], axis=0)
+        dd = np.diagonal(g.dd, axis1=1, axis2=2)
+        squares = np.maximum(np.diagonal(g.zz, axis1=1, axis2=2)[:, 3:], 1e-300)
+        constant = np.sum(g.zd[:, 3:] ** 2 / squares[:, :, None], axis=1)
         size = np.maximum(dd - constant, 1e-12 * dd)
         o = g.part_output[raw]
-        np.add.at(out, g.part_term[raw], size[g.part_series[raw]] * g.projector[o, o] / g.noise[o] ** 2)
+        np.add.at(out.T, g.part_term[raw], (size[:, g.part_series[raw]] * g.projector[o, o] / g.noise[o] ** 2).T)
     if g.aa.any():
-        out += np.diagonal(total.aa[0])[g.own :]
+        out += np.diagonal(g.aa, axis1=1, axis2=2)[:, g.own :]
     return out
+
+
+def explained_by_each(g: Grams) -> tuple[Array, NDArray[np.int_]]:
+    """(B,) reduction of the sum of squares by all terms of each block or set, in noise of unit variance, and (B,) how
+    many directions are identifiable."""
+    n, y = normal(g)
+    root = np.sqrt(np.maximum(own_information_of_each(g), 1e-300))
+    values, vectors = np.linalg.eigh(n / (root[:, :, None] * root[:, None, :]))
+    seen = values > IDENTIFIABLE
+    shown = (vectors.swapaxes(1, 2) @ (y / root)[:, :, None])[:, :, 0]
+    return np.sum(np.where(seen, shown**2 / np.where(seen, values, 1.0), 0.0), axis=1), seen.sum(axis=1)
 
 
 def family_p(g: Grams, sensors: Sequence[str], subset: Sequence[int] | None = None) -> float:

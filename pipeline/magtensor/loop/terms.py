@@ -59,6 +59,11 @@ class Terms:
         """The same at some of the samples."""
         return replace(self, series=self.series[samples])
 
+    def like(self, other: Terms) -> bool:
+        """Whether the two differ in their series only, names and units apart."""
+        own, its = _places(self), _places(other)
+        return self.series.shape == other.series.shape and all(map(np.array_equal, own, its))
+
     def only(self, keep: Iterable[int]) -> Terms:
         """The terms of these numbers, in this order."""
         order = list(keep)

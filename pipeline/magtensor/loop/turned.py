@@ -139,19 +139,15 @@ class TurnedColour:
         With columns A of the noise's standard deviation, G = A' A and its Cholesky factor K of 1 + G, the filter
         1 - A (1 + K')^-1 K^-1 A' is a root of (1 + A A')^-1.
         """
-        columns = series.reshape(len(series), -1)
-        out: Array = columns - self.modes.made_of(self._taken @ self.modes.seen_in(columns)[: len(self.variance)])
-        return out.reshape(series.shape)
-
-    @cached_property
-    def _taken(self) -> Array:
-        """(M, M) what the filter takes off, from what the modes' columns show: size (1 + K')^-1 K^-1 size."""
         from scipy.linalg import solve_triangular
 
         size, root = self._root
-        left = solve_triangular(root + np.eye(len(size)), np.diag(size), lower=True)
-        out: Array = left.T @ solve_triangular(root, np.diag(size), lower=True)
-        return out
+        columns = series.reshape(len(series), -1)
+        shown = size[:, None] * self.modes.seen_in(columns)[: len(size)]
+        taken = solve_triangular(root, shown, lower=True, check_finite=False)
+        taken = solve_triangular(root + np.eye(len(size)), taken, trans="T", lower=True, check_finite=False)
+        out: Array = columns - self.modes.made_of(size[:, None] * taken)
+        return out.reshape(series.shape)
 
 
 def excess_of(colour: Colour, most: int) -> Array:
