@@ -7,7 +7,6 @@ the common one. They are modelled while calibrating and never taken off another 
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from magtensor.calibration.types import Array
@@ -30,7 +29,7 @@ def _places(x: Excitation) -> Array:
 def _seen(x: Excitation, world: Array) -> Array:
     """(N, S, 3) nT on the raw outputs of a field (N, S, 3) in the world frame."""
     turned = x.world_axes @ x.from_platform.T
-    return x.sensed(np.einsum("nki,nsk->nsi", turned, world))
+    return x.sensed(world @ turned)
 
 
 @error_model(
@@ -86,8 +85,11 @@ def _harmonic(name: str, places: Array) -> Array:
     out = np.zeros_like(places)
     for i, polynomial in enumerate(field_polynomials(name)):
         for powers, value in polynomial.items():
-            exponents: NDArray[np.int_] = np.array(powers)
-            out[..., i] += value * np.prod(places**exponents, axis=-1)
+            product = np.full(places.shape[:2], value)
+            for axis, power in enumerate(powers):
+                for _ in range(power):  # many times quicker than a power of floating-point numbers
+                    product *= places[..., axis]
+            out[..., i] += product
     return out
 
 

@@ -8,7 +8,7 @@ from typing import Any
 from loop_cases import BASE, adopted_names, scenario, verdict_of
 
 MODELS = ("site_gradient", "fixed_source", "nonlinearity_cubic")
-LOGGED: dict[str, Any] = {"motion": BASE["motion"] | {"duration_s": 900.0}, "logging": {"attitude": True}}
+LOGGED: dict[str, Any] = {"motion": BASE["motion"] | {"duration_s": 600.0}, "logging": {"attitude": True}}
 
 
 def test_a_gradient_beside_a_nonlinearity_is_no_source_near_the_rig(tmp_path: Path) -> None:

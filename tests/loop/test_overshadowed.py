@@ -14,7 +14,7 @@ from magtensor.registry import Registry
 MODELS = ("nonlinearity_quadratic", "nonlinearity_cubic", "current_field", "site_gradient")
 
 
-SHORT = BASE["motion"] | {"duration_s": 1000.0}
+SHORT = BASE["motion"] | {"duration_s": 700.0}
 
 
 def gradient(rms_nT: float) -> dict[str, Any]:
@@ -48,7 +48,7 @@ def test_larger_effects_and_those_that_do_not_follow_the_attitude_are_kept_besid
 def test_what_happens_once_overshadows_nothing(tmp_path: Path) -> None:
     passing = {
         "type": "passing_source",
-        "time_s": 500.0,
+        "time_s": 350.0,
         "closest_m": [12.0, 0.0, 0.0],
         "velocity_m_s": [0.0, 0.5, 0.0],
     }

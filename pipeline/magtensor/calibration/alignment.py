@@ -16,6 +16,7 @@ from magtensor.errors import DataError, NotEnoughData
 
 from .agreement import require_agreement
 from .axes import axis_faults, turned_words
+from .by_sensor import by_sensor
 from .covariance import Influence, scalar_influence
 from .factors import CHOLESKY, POLAR
 from .rotation import LI_SEQUENCE, cross_matrix, nearest_orthogonal, sequence, sequence_derivatives
@@ -233,7 +234,7 @@ def align(b: Array, calibrations: Sequence[SensorCalibration], reference: int, a
     rotation = np.array([a.rotation for a in found])
     offset = np.array([c.offset for c in calibrations])
     matrix = rotation @ np.array([c.matrix for c in calibrations])
-    require_agreement(np.einsum("sij,nsj->nsi", rotation, b), np.linalg.norm(b[:, reference], axis=1))
+    require_agreement(by_sensor(rotation, b), np.linalg.norm(b[:, reference], axis=1))
     planar = [s for s in range(sensors) if hands[s].undetermined and s != reference]
     unobservable = [COMMON_ROTATION]
     if planar:
@@ -241,7 +242,7 @@ def align(b: Array, calibrations: Sequence[SensorCalibration], reference: int, a
             f"the handedness of sensor{'s' if len(planar) > 1 else ''} "
             f"{', '.join(str(s + 1) for s in planar)}: the field stayed in a plane, right-handed axes assumed"
         )
-    contrast = b[:, [reference]] - np.einsum("sij,nsj->nsi", rotation, b)
+    contrast = b[:, [reference]] - by_sensor(rotation, b)
     diagnostics: dict[str, float | str] = {
         f"contrast_rms_{s + 1}_nT": float(np.sqrt(np.mean(contrast[:, s] ** 2)))
         for s in range(sensors)

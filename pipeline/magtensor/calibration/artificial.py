@@ -17,6 +17,7 @@ from magtensor.errors import DataError
 from .agreement import require_agreement
 from .alignment import COMMON_ROTATION, handedness
 from .axes import axis_faults
+from .by_sensor import by_sensor
 from .covariance import scalar_influence
 from .rotation import nearest_orthogonal
 from .scalar import checked_samples
@@ -69,7 +70,7 @@ def calibrate_to_mean(
     reference = platform.apply(mean)
     fits = [levenberg_marquardt(raw[:, s], reference) for s in range(sensors)]
     matrix, offset = np.array([f.matrix for f in fits]), np.array([f.offset for f in fits])
-    b = np.einsum("sij,nsj->nsi", matrix, raw - offset)
+    b = by_sensor(matrix, raw - offset)
     contrast = reference[:, None] - b
     noise = _noise(contrast, platform, matrix)
     diagnostics: dict[str, float | str] = {

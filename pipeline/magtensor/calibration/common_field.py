@@ -72,14 +72,14 @@ def common_field(raw: Array, noise: Array | None = None, keep: Mask | None = Non
         raise MissingAttitudes(
             f"{count} samples cannot tell the field from the sensors", hint="five attitudes are the least"
         )
-    mean, moments = _moments(used)
+    mean, factor = _factor(used)
     sd = np.ones(size) if noise is None else np.asarray(noise, dtype=float).ravel()
     if size == 3:
         basis, own = np.eye(3), np.zeros((3, 3))
     elif noise is not None:
-        basis, own = _plane(moments / np.outer(sd, sd))
+        basis, own = _plane(factor / sd)
     else:
-        sd, basis, own = _with_noise(moments, count)
+        sd, basis, own = _with_noise(factor, count)
     if size > 3:
         freedom = (size - 3) * (count - 4) / count  # three coordinates a sample, and the plane's own parameters
         chi2 = float(np.trace(own) / max(freedom, 1e-9)) if count > 4 else float("nan")
@@ -120,52 +120,55 @@ def _handed(basis: Array) -> Array:
     return basis * np.array([flip, 1.0, 1.0])
 
 
-def _moments(raw: Array) -> tuple[Array, Array]:
-    """Mean (3 S,) and covariance (3 S, 3 S) of raw outputs, in chunks."""
+def _factor(raw: Array) -> tuple[Array, Array]:
+    """Mean (3 S,) of raw outputs and a factor R (min(N, 3 S), 3 S) of their covariance R' R, in chunks.
+
+    The covariance itself, of a field a million times the noise, would hold the noise with four digits.
+    """
     flat = raw.reshape(len(raw), -1)
+    chunks = range(0, len(flat), _CHUNK)
     centre = flat[0]
-    total, square = np.zeros(flat.shape[1]), np.zeros((flat.shape[1],) * 2)
-    for start in range(0, len(flat), _CHUNK):
-        part = flat[start : start + _CHUNK] - centre
-        total += part.sum(axis=0)
-        square += part.T @ part
-    mean = total / len(flat)
-    return mean + centre, square / len(flat) - np.outer(mean, mean)
+    mean = centre + sum((flat[i : i + _CHUNK] - centre).sum(axis=0) for i in chunks) / len(flat)
+    factor = np.zeros((0, flat.shape[1]))
+    for i in chunks:
+        rows = np.concatenate([factor, flat[i : i + _CHUNK] - mean])
+        factor = np.asarray(np.linalg.qr(rows, mode="r"), dtype=float)
+    return mean, factor / np.sqrt(len(flat))
 
 
-def _plane(moments: Array) -> tuple[Array, Array]:
-    """The three leading axes (n, 3) of whitened moments, and the moments perpendicular to them."""
-    values, vectors = np.linalg.eigh(moments)
-    basis = vectors[:, -3:][:, ::-1]
-    if values[-3] <= 1e-12 * values[-1]:
+def _plane(factor: Array) -> tuple[Array, Array]:
+    """The three leading axes (n, 3) of whitened outputs, from a factor of their moments, and the moments perpendicular
+    to them."""
+    _, size, axes = np.linalg.svd(factor, full_matrices=False)
+    if size[2] <= 1e-6 * size[0]:
         raise MissingAttitudes(
             "the outputs never leave a plane: the field was never turned about a second axis",
             hint="turn the array about more than one axis",
         )
-    own = moments - (basis * values[-3:][::-1]) @ basis.T
-    return basis, own
+    across = size[3:, None] * axes[3:]
+    return axes[:3].T, across.T @ across
 
 
-def _with_noise(moments: Array, count: int) -> tuple[Array, Array, Array]:
+def _with_noise(factor: Array, count: int) -> tuple[Array, Array, Array]:
     """Noise of each output, plane and perpendicular moments, by alternating between the two.
 
     Below `LEAST_SAMPLES_PER_AXIS` samples an axis, and with two sensors (whose axes share one residual), all
     outputs are given the same noise.
     """
-    size = len(moments)
+    size = factor.shape[1]
     sd = np.ones(size)
-    basis, own = _plane(moments)
+    basis, own = _plane(factor)
     sd *= np.sqrt(max(np.trace(own), 1e-300) * count / (max(count - 4, 1) * (size - 3)))
     if size <= 6 or count < LEAST_SAMPLES_PER_AXIS * size:
-        basis, own = _plane(moments / np.outer(sd, sd))
+        basis, own = _plane(factor / sd)
         return sd, basis, own
     for _ in range(200):
-        basis, own = _plane(moments / np.outer(sd, sd))
+        basis, own = _plane(factor / sd)
         share = 1.0 - np.sum(basis**2, axis=1)
         variance = np.diag(own) / np.maximum(share, 1e-6) * count / (count - 4)
         step = np.sqrt(np.clip(variance, 0.1, 10.0))
-        sd = np.maximum(sd * step, np.sqrt(LEAST_SHARE * np.mean(sd**2)))
-        if np.max(np.abs(step - 1)) < 1e-6:
+        before, sd = sd, np.maximum(sd * step, np.sqrt(LEAST_SHARE * np.mean(sd**2)))
+        if np.max(np.abs(sd / before - 1)) < 1e-6:
             break
-    basis, own = _plane(moments / np.outer(sd, sd))
+    basis, own = _plane(factor / sd)
     return sd, basis, own

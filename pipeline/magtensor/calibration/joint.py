@@ -23,6 +23,7 @@ from magtensor.errors import DataError, NotEnoughData
 from .agreement import require_agreement
 from .axes import mirrored_words, turned_words
 from .blocks import Blocks, blocks_of
+from .by_sensor import by_sensor
 from .common_field import CommonField
 from .coverage import WORST_ERROR, Coverage, coverage, require_coverage
 from .joint_covariance import forward_covariance, to_corrections
@@ -203,7 +204,7 @@ def refuse_sensors(forward: Array, offset: Array, raw: Array, total_field: Array
     """Mirrored sensors, and those that have nothing in common with the others, whose C is next to singular."""
     some = slice(None, None, max(1, len(raw) // 20_000))
     correction = np.asarray(np.linalg.pinv(forward, rcond=1e-9), dtype=np.float64)
-    require_agreement(np.einsum("sij,nsj->nsi", correction, raw[some] - offset), total_field[some])
+    require_agreement(by_sensor(correction, raw[some] - offset), total_field[some])
     words = mirrored_words(correction)
     if words:
         raise DataError(

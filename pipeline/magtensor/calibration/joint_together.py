@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from magtensor.errors import DataError, NotEnoughData
 
+from .by_sensor import by_sensor
 from .common_field import CommonField, common_field, output_noise
 from .coverage import coverage_alone, require_coverage
 from .maximum_likelihood import CHUNK, ScalarFit, along, fit_scalar
@@ -136,7 +137,7 @@ def _by_own_residual(
 def told_apart(noise: Array, found: tuple[Array, Array], raw: Array, total_field: Array) -> Array:
     """(2, 3) nT: the noise that two sensors' contrast shows, given to each as the total field tells them apart."""
     forward, offset = found
-    b = np.einsum("sij,nsj->nsi", np.linalg.pinv(forward, rcond=1e-9), raw - offset)
+    b = by_sensor(np.linalg.pinv(forward, rcond=1e-9), raw - offset)
     out: Array = np.sqrt(np.sum(noise**2, axis=0) * shares_of_two(b, total_field)[:, None])
     return out
 

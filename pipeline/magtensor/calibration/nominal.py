@@ -23,6 +23,7 @@ import numpy as np
 from magtensor.errors import DataError, NotEnoughData
 
 from .agreement import require_agreement
+from .by_sensor import by_sensor
 from .common_field import CommonField
 from .coverage import WORST_ERROR, coverage
 from .joint import JointFit, Posterior, nearest_frame
@@ -239,7 +240,7 @@ def _fields(rows: Array, flat: Array, unit: float) -> Array:
     """(N, S, 3) nT of each sensor alone."""
     sensors = len(rows) // 3
     forward, offset = rows[:, :3].reshape(sensors, 3, 3), rows[:, 3].reshape(sensors, 3) * unit
-    out: Array = np.einsum("sij,nsj->nsi", np.linalg.inv(forward), flat.reshape(len(flat), sensors, 3) - offset)
+    out: Array = by_sensor(np.linalg.inv(forward), flat.reshape(len(flat), sensors, 3) - offset)
     return out
 
 

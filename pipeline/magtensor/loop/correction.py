@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from magtensor.calibration.by_sensor import by_sensor
 from magtensor.calibration.types import Array, ArrayCalibration
 from magtensor.loop.model import Adopted, Record, State, without
 from magtensor.loop.waveform import NAME, course_of
@@ -53,7 +54,7 @@ def corrected_raw(
     forward = np.linalg.inv(calibration.matrix)
     for _ in range(MOST_STEPS):
         b = calibration.apply(raw)
-        output = np.einsum("sij,nsj->nsi", forward, b) + calibration.offset
+        output = by_sensor(forward, b) + calibration.offset
         x = record.excitation(_whole(output), _whole(b))
         after = record.raw
         for model, coefficients in own:
@@ -86,7 +87,7 @@ def _as_it_is_here(record: Record, calibration: ArrayCalibration, model: Adopted
     free = np.eye(3 * sensors) - held @ np.linalg.pinv(held, rcond=1e-9)
 
     def contrast(outputs: Array) -> Array:
-        b = np.einsum("sij,nsj->nsi", calibration.matrix, outputs)[usable]
+        b = by_sensor(calibration.matrix, outputs)[usable]
         out: Array = (b.reshape(len(b), -1) @ free).ravel()
         return out
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtensor.accuracy import error_block
+from magtensor.calibration.by_sensor import by_sensor
 from magtensor.calibration.joint import nearest_frame
 from magtensor.calibration.types import Array
 from magtensor.errors import DataError, NotEnoughData
@@ -83,7 +84,7 @@ def held_out_error(
         x = excitation_of(record, state.fit)
         raw, field = without(record, [a.terms(x) for a in adopted], state.theta)
         matrix = np.linalg.inv(state.fit.forward @ nearest_frame(state.fit.forward))
-        return np.einsum("sij,nsj->nsi", matrix, raw[test] - state.fit.offset), None if field is None else field[test]
+        return by_sensor(matrix, raw[test] - state.fit.offset), None if field is None else field[test]
 
     folds = shared_out(calibrated_fold, range(len(edges) - 1))
     b, reference = [], []

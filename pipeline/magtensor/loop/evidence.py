@@ -334,9 +334,8 @@ def _loss(train: Grams, test: Grams, theta: Array) -> Array:
             w[:, train.part_series[j], o] += theta[:, train.part_term[j]] / train.noise[o]
         w = w @ train.projector
         own = np.linalg.solve(train.zz, train.ze - train.zd @ w)
-        loss += test.ee + np.einsum("bij,bik,bkj->b", own, test.zz, own) + np.einsum("bij,bik,bkj->b", w, test.dd, w)
-        loss += 2 * np.einsum("bij,bik,bkj->b", own, test.zd, w)
-        loss -= 2 * (np.einsum("bij,bij->b", own, test.ze) + np.einsum("bij,bij->b", w, test.de))
+        loss += test.ee + np.sum(own * (test.zz @ own + 2 * (test.zd @ w - test.ze)), axis=(1, 2))
+        loss += np.sum(w * (test.dd @ w - 2 * test.de), axis=(1, 2))
     if train.aa.any():
         m = train.own
         inverse = _inverse(train.aa[:, :m, :m])

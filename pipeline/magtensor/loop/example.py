@@ -7,6 +7,7 @@ from fnmatch import fnmatchcase
 import numpy as np
 
 from magtensor.attitude import into_platform
+from magtensor.calibration.by_sensor import by_sensor
 from magtensor.calibration.types import Array
 from magtensor.components import Component
 from magtensor.loop.excitation import VECTORS, Excitation
@@ -45,7 +46,7 @@ def example_survey(
         changing = GRADIENT_NT_PER_M * (1.0 + 0.5 * _smooth(time, 1, 0.02))[:, :, None]
         field = field + np.einsum("nij,njk,nlk,sl->nsi", into, changing, into, position)
     matrix = np.eye(3) + 0.02 * rng.standard_normal((sensors, 3, 3))
-    output = np.einsum("sij,nsj->nsi", matrix, field) + 100.0 * rng.standard_normal((sensors, 3))
+    output = by_sensor(matrix, field) + 100.0 * rng.standard_normal((sensors, 3))
     logged, units = _channels(component, time, sensors)
     return Excitation(
         time=time,

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtensor.attitude import into_platform_frame, to_world
+from magtensor.calibration.by_sensor import by_sensor
 from magtensor.calibration.types import Array
 from magtensor.errors import did_you_mean
 from magtensor.loop.held_logs import unheld
@@ -167,9 +168,7 @@ class Excitation:
 
     def sensed(self, vectors: Array) -> Array:
         """C v (N, S, 3): what the sensors make of a vector (N, 3), or one for each sensor, in the common frame."""
-        each = vectors[:, None] if vectors.ndim == 2 else vectors
-        out: Array = np.einsum("sij,nsj->nsi", self.matrix, np.broadcast_to(each, self.output.shape))
-        return out
+        return by_sensor(self.matrix, vectors)
 
     @cached_property
     def world_axes(self) -> Array:

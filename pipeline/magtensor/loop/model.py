@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtensor.calibration import joint
+from magtensor.calibration.by_sensor import by_sensor
 from magtensor.calibration.coverage import Coverage
 from magtensor.calibration.joint import JointFit, fit_joint, nearest_frame
 from magtensor.calibration.nominal import Nominal, fit_nominal
@@ -324,7 +325,7 @@ def excitation_of(record: Record, fit: JointFit, lines: Sequence[float] = ()) ->
     """Modelled outputs and field of every sample from the common field of a fit."""
     q = nearest_frame(fit.forward)
     b = fit.scalar.field(fit.plane.coordinates(record.raw)) if fit.posterior is None else fit.posterior.field
-    output = np.einsum("sij,nj->nsi", fit.forward, b) + fit.offset
+    output = by_sensor(fit.forward, b) + fit.offset
     common = np.repeat((b @ q)[:, None], len(record.sensors), axis=1)
     return record.excitation(output, common, lines)
 

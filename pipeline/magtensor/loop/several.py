@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from magtensor.calibration.by_sensor import by_sensor
 from magtensor.calibration.common_scale import nominal
 from magtensor.calibration.maximum_likelihood import along
 from magtensor.calibration.surveys.directions import across
@@ -214,7 +215,7 @@ def _excitation(of: Together, samples: Samples, fit: SurveysFit, survey: int) ->
     raw = samples.raw[samples.survey == survey]
     y = ((raw - offset).reshape(len(raw), -1) / fit.plane.noise) @ fit.plane.basis
     b = y @ fit.found.matrix.T
-    output = np.einsum("sij,nj->nsi", fit.forward, b) + offset
+    output = by_sensor(fit.forward, b) + offset
     common = np.repeat((factor * b @ turn)[:, None], len(forward), axis=1)
     x = of.records[survey].excitation(output, common)
     vars(x)["matrix"] = forward / factor  # that of all surveys

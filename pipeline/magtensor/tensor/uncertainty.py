@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from magtensor.calibration.by_sensor import by_sensor
 from magtensor.calibration.types import PARAMETERS_PER_SENSOR, ArrayCalibration
 from magtensor.errors import DataError
 from magtensor.tensor.assembly import Assembly, checked_noise_covariance
@@ -192,7 +193,7 @@ def _calibration_terms(
     forms = np.stack([influence[p] @ covariance @ influence[q].T for p, q in zip(*pairs, strict=True)])
     for start in range(0, len(fields), _CHUNK):
         part = slice(start, start + _CHUNK)
-        raw = np.einsum("sij,nsj->nsi", inverse, fields[part])
+        raw = by_sensor(inverse, fields[part])
         parts = [raw.reshape(len(raw), -1), np.ones((len(raw), 1))]
         z = np.concatenate(parts if taken_off is None else [*parts, taken_off.series[part]], axis=1)
         yield part, np.stack([np.einsum("np,np->n", z @ form, z) for form in forms], axis=1)

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from magtensor.calibration.by_sensor import by_sensor
 from magtensor.calibration.coverage import WORST_ERROR, require_coverage
 from magtensor.calibration.joint_together import LEAST_FOR_REJECTION
 from magtensor.calibration.postures import attitude_design, sphere
@@ -188,7 +189,7 @@ def _alike(
         c, o = design.forward(parameters, k)
         off_c, off_o = own_deviation(design, one, variance, not shared)
         seen = view(OneSurvey(samples.raw[own], samples.total_field[own]), c + off_c, o + off_o, design.noise)
-        raw[own] += np.einsum("sij,nj->nsi", c0 - c - off_c, seen.field)
+        raw[own] += by_sensor(c0 - c - off_c, seen.field)
         raw[own] += o0 - o if shared else -off_o
     return replace(samples, raw=raw)
 
