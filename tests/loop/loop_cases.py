@@ -35,7 +35,7 @@ BASE: dict[str, Any] = {
         "errors": {"scale": 0.01, "non_orthogonality_deg": 0.5, "misalignment_deg": 1.0, "bias_nT": 100.0},
         "noise": {"white_sd_nT": 0.15, "flicker_nT_per_rtHz": 0.01},
     },
-    "motion": {"type": "tumbling", "duration_s": 1800.0, "rate_rms_deg_s": 15.0, "rate_time_s": 5.0},
+    "motion": {"type": "tumbling", "duration_s": 1200.0, "rate_rms_deg_s": 15.0, "rate_time_s": 5.0},
     "field": {
         "earth": {"total_field_nT": 49500.0, "inclination_deg": 66.0, "declination_deg": 4.0},
         "variation": {

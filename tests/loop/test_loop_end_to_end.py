@@ -227,9 +227,11 @@ def test_a_declared_model_without_its_channel_is_refused_in_words(tmp_path: Path
 def test_verification_is_as_good_as_with_the_effect_declared(tmp_path: Path) -> None:
     coefficients = [[0.3, -0.1, 0.2], [-0.4, 0.2, 0.1], [0.1, 0.3, -0.2], [0.2, -0.2, 0.4]]
     effect = {"type": "temperature_offset", "lag_s": 100.0, "reference_degC": 20.0, "nT_per_degC": coefficients}
-    survey = survey_file(tmp_path, scenario(8, effect))
-    verify = survey_file(tmp_path, scenario(9, effect), "verify.h5")
-    run_recipe(RECIPE, tmp_path / "found", survey=survey, verify=verify)
+    longer = scenario()["motion"] | {"duration_s": 1800.0}
+    survey = survey_file(tmp_path, scenario(8, effect, motion=longer))
+    verify = survey_file(tmp_path, scenario(9, effect, motion=longer), "verify.h5")
+    lasting = [f"stages.close_loop.search=[{', '.join(lasting_effects())}]"]
+    run_recipe(RECIPE, tmp_path / "found", survey=survey, verify=verify, overrides=lasting)
     recipe = yaml.safe_load(RECIPE.read_text())
     declared = {"temperature_offset": {"channel": "temperature", "lag_s": 100.0}}
     recipe["stages"][recipe["stages"].index("close_loop")] = {"close_loop": {"declared": declared, "search": []}}

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from loop_cases import adopted_names, loaded, scenario, verdict_of
+from loop_cases import adopted_names, lasting_effects, loaded, scenario, verdict_of
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 from scipy.stats import norm
@@ -163,7 +163,7 @@ def test_a_strong_slow_effect_of_the_worse_of_two_sensors(tmp_path: Path) -> Non
     """Thirteen times its noise; in noise of the residual's own colour next to nothing of it is left."""
     coefficients = [[0.0, 0.0, 0.0], [-40.0, -330.0, 430.0]]
     effect = {"type": "temperature_offset", "lag_s": 0.0, "reference_degC": 20.0, "nT_per_degC": coefficients}
-    found = verdict_of(tmp_path, two_unlike(2, effect))
+    found = verdict_of(tmp_path, two_unlike(2, effect), models=lasting_effects())
     assert adopted_names(found) == {"temperature_offset"}
     value = {(c["sensor"], c["name"]): c["value"] for c in found["adopted"][0]["coefficients"]}
     for axis, true in zip("xyz", coefficients[1], strict=True):
