@@ -218,3 +218,13 @@ def test_error_falls_with_the_number_of_samples() -> None:
         np.median([tensor_error(s, fitted(s)) for s in (drawn(seed, n) for seed in range(6))]) for n in (50, 800, 12800)
     ]
     assert all(3.0 < a / b < 5.3 for a, b in pairwise(errors))  # 4 by the square root
+
+
+def test_the_noise_does_not_lose_digits_beside_a_large_field() -> None:
+    """The plane takes the part of the noise that goes with the field, however large that is, but for the square of
+    noise over field: a few millionths for the smaller one."""
+    rng = np.random.default_rng(3)
+    field = rng.standard_normal((2000, 1, 3))
+    noise = 0.1 * rng.standard_normal((2000, 4, 3))
+    small, large = (common_field(size * field + noise).noise for size in (100.0, 50_000.0))
+    np.testing.assert_allclose(large, small, rtol=1e-5)
