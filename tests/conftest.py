@@ -6,7 +6,10 @@ import os
 from collections.abc import Iterator
 
 import pytest
+from hypothesis import settings
 
+settings.register_profile("seeded", derandomize=True)
+settings.load_profile("seeded")
 os.environ["MAGTENSOR_PROCESSES"] = "1"  # the tests themselves share the cores
 
 
