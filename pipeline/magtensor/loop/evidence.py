@@ -176,7 +176,7 @@ def grams(residual: Residual, terms: Terms, across: Colour, along: Colour | Turn
     return grams_in(Whitened.of(residual, across, along), terms, blocks)
 
 
-_Sums = Callable[[Array, Array], tuple[Array, Array]]
+_Sums = Callable[[Array, Array], tuple[Array, Array]]  # of what is known and what is new (N, .), and of the new alone
 
 
 def grams_in(white: Whitened, terms: Terms | None, blocks: int = 1) -> Grams:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -138,38 +138,36 @@ def best_settings(
     grid = [g for g in settings_grid(model, state.excitation) if not _already(state, model, g)]
     if len(grid) == 1:
         return [(grid[0], 1.0)]
-    tested: list[tuple[dict[str, Any], Terms]] = []
-    for settings in grid:
-        terms = few.terms(model, settings, failed)
-        if terms is not None and terms.count:
-            tested.append((settings, terms))
-    if not tested:
-        return []
     scores: list[tuple[float, float, dict[str, Any]]] = []
     chain: list[float] = []
     last: Array | None = None
-    for several in _batches([terms for _, terms in tested]):
-        white, coloured = few.white.of_each(several), few.coloured.of_each(several)
-        scores += [(w, c, tested[len(scores) + i][0]) for i, (w, c) in enumerate(zip(white, coloured, strict=True))]
+    made = ((settings, few.terms(model, settings, failed)) for settings in grid)
+    for batch in _batches((settings, terms) for settings, terms in made if terms is not None and terms.count):
+        several = [terms for _, terms in batch]
+        both = zip(few.white.of_each(several), few.coloured.of_each(several), strict=True)
+        scores += [(white, coloured, settings) for (white, coloured), (settings, _) in zip(both, batch, strict=True)]
         for terms in several:
             series = projected(terms, few.freedom)
             if last is not None:
                 chain.append(alike(last, series))
             last = series
+    if not scores:
+        return []
     tried = effective_tests(chain, alpha)
     best = max(scores, key=lambda s: s[0])[2], max(scores, key=lambda s: s[1])[2]
     return [(settings, tried) for settings in (best[:1] if best[0] is best[1] else best)]
 
 
-def _batches(terms: Sequence[Terms]) -> Iterator[list[Terms]]:
-    """Neighbouring terms that differ in their series only, not too many at a time."""
-    batch: list[Terms] = []
-    for each in terms:
-        if batch and (len(batch) * each.series.size > BATCH_ENTRIES or not batch[0].like(each)):
+def _batches(made: Iterable[tuple[dict[str, Any], Terms]]) -> Iterator[list[tuple[dict[str, Any], Terms]]]:
+    """Neighbouring settings whose terms differ in their series only; so few at a time that they take little memory."""
+    batch: list[tuple[dict[str, Any], Terms]] = []
+    for settings, terms in made:
+        if batch and (len(batch) * terms.series.size > BATCH_ENTRIES or not batch[0][1].like(terms)):
             yield batch
             batch = []
-        batch.append(each)
-    yield batch
+        batch.append((settings, terms))
+    if batch:
+        yield batch
 
 
 def refined(model: Component, settings: dict[str, Any], state: State, failed: dict[str, str]) -> dict[str, Any]:
