@@ -7,7 +7,7 @@ from pathlib import Path
 
 from magtensor.components import Component
 from magtensor.loop.example import example_survey
-from magtensor.loop.settings import AnyChannel, Choice, Duration, EventTimes, Frequencies, Range
+from magtensor.loop.settings import AnyChannel, Choice, Delays, Duration, EventTimes, Frequencies, Range
 from magtensor.registry import Registry
 
 PAGE = Path(__file__).with_name("error_models.md")
@@ -101,6 +101,9 @@ def _coefficients(model: Component) -> str:
 
 
 def _in_words(mark: object) -> str:
+    if isinstance(mark, Delays):
+        grid = f"{mark.count} within {mark.evenly:g}, growing by half up to {mark.high:g}, and whole hours"
+        return f"{grid}, as far as the station's readings reach; the best refined"
     if isinstance(mark, Range):
         share = " of the survey's duration" if mark.of_duration else ""
         return f"{mark.low:g} to {mark.high:g}{share} in {mark.count} {mark.spacing} steps, the best refined"

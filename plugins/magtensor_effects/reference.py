@@ -10,12 +10,12 @@ from magtensor.calibration.types import Array
 from magtensor.components import error_model
 from magtensor.errors import DataError
 from magtensor.loop.excitation import Excitation
-from magtensor.loop.settings import Range
+from magtensor.loop.settings import Delays
 from magtensor.loop.terms import Terms, joined
 from magtensor_effects.ageing import EventTime, Order, Span, courses
 
 NEARBY_S = 2.0  # shorter delays show as the slope over this time
-LONGEST_S = 120.0
+LONGEST_S = 7200.0  # two time zones
 BETWEEN_NOISE_AND_DELAY = 0.75  # of the lag: half of it is what noise makes, all of it a delay
 
 
@@ -67,21 +67,19 @@ def reference_clock(
     *,
     lag_s: Annotated[
         float,
-        Range(-LONGEST_S, LONGEST_S, count=17),
+        Delays(-LONGEST_S, LONGEST_S, count=17),
         Field(description="delay about which it is linear, s: positive where the stamps are late"),
     ] = 0.0,
 ) -> Terms:
     """The base station's time stamps are late or early.
 
     A reading stamped t was taken at t - d, so that F(t + d) would be right at t: the recorded F(t) minus F(t + lag_s),
-    over lag_s; the coefficient is the delay d. Beyond the ends the field is held. Shows on active days only.
+    over lag_s; the coefficient is the delay d. Beyond the station's own readings the field is held. Shows on active
+    days only.
     """
-    f = _total_field(x)
-    if abs(lag_s) >= NEARBY_S:
-        return x.on_reference((f - np.interp(x.time + lag_s, x.time, f)) / lag_s, "s", "delay")
-    earlier, later = x.time - NEARBY_S / 2, x.time + NEARBY_S / 2
-    slope = (np.interp(later, x.time, f) - np.interp(earlier, x.time, f)) / NEARBY_S
-    return x.on_reference(-slope, "s", "delay")
+    begin, end = (0.0, lag_s) if abs(lag_s) >= NEARBY_S else (-NEARBY_S / 2, NEARBY_S / 2)
+    earlier, later = x.readings.at(x.time + begin), x.readings.at(x.time + end)
+    return x.on_reference((earlier - later) / (end - begin), "s", "delay")
 
 
 @error_model(

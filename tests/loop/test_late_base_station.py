@@ -12,13 +12,21 @@ from loop_cases import scenario, verdict_of
 SEARCHED = ["reference_clock", "reference_scale", "reference_drift", "scale_drift"]
 
 
-@pytest.mark.parametrize(("delay_s", "seed"), [(12.0, 41), (-45.0, 42)])
-def test_the_delay_is_found_and_the_lag_is_the_delay(delay_s: float, seed: int, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("delay_s", "seed", "beyond_s"),
+    [(12.0, 41, 60.0), (-45.0, 42, 60.0), (-910.0, 45, 1200.0), (3600.0, 44, 5400.0)],
+    ids=["seconds", "early", "minutes", "a time zone"],
+)
+def test_the_delay_is_found_and_the_lag_is_the_delay(
+    delay_s: float, seed: int, beyond_s: float, tmp_path: Path
+) -> None:
     def late(path: Path) -> None:
         with h5py.File(path, "a") as file:
             file["reference/time"][:] = file["reference/time"][:] + delay_s
 
-    told = verdict_of(tmp_path, scenario(seed), late, SEARCHED)
+    survey = scenario(seed)
+    survey["base_station"] |= {"first_s": -beyond_s, "last_s": survey["motion"]["duration_s"] + beyond_s}
+    told = verdict_of(tmp_path, survey, late, SEARCHED)
     assert [a["error_model"] for a in told["adopted"]] == ["reference_clock"], told["unexplained"]["description"]
     found = told["adopted"][0]
     delay = found["coefficients"][0]

@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from magtensor.attitude import into_platform_frame, to_world
 from magtensor.calibration.by_sensor import by_sensor
 from magtensor.calibration.types import Array
-from magtensor.errors import did_you_mean
+from magtensor.errors import DataError, did_you_mean
 from magtensor.loop.held_logs import unheld
+from magtensor.loop.station import Station
 from magtensor.loop.terms import REFERENCE, Terms
 
 AXES = "xyz"
@@ -42,6 +43,7 @@ class Excitation:
         attitude: (N, 4) scalar last, platform to world; None where not known.
         lines: Hz, the strongest lines in the residual's spectrum, for models that look for one.
         waveform: (N,) of a source that nobody logged, found in what the sensors share; None where none was.
+        station: the base station's own readings; None where `total_field` is all that is known of it.
         part_of: what this is a part of, and the numbers of the samples in it; None for a whole survey.
         courses: name of a thermometer -> its log, and its course without the noise of the log; filled as they are
             asked for, so that one is made for all fits of a record.
@@ -61,6 +63,7 @@ class Excitation:
     attitude: Array | None = None
     lines: Sequence[float] = ()
     waveform: Array | None = None
+    station: Station | None = None
     part_of: tuple[Excitation, NDArray[np.int_]] | None = None
     courses: dict[str, tuple[Array, Array]] = dataclasses.field(default_factory=dict, compare=False, repr=False)
 
@@ -97,6 +100,17 @@ class Excitation:
     def elapsed(self) -> Array:
         """(N,) s since the survey's start."""
         return self.time - self.start
+
+    @cached_property
+    def readings(self) -> Station:
+        """Of the reference total field: the base station's own, or those at the samples.
+
+        Raises:
+            DataError: there is no reference.
+        """
+        if self.total_field is None:
+            raise DataError("the survey has no reference total field")
+        return self.station or Station(self.time, self.total_field)
 
     def channels_like(self, pattern: str, without: tuple[str, ...] = ()) -> list[str]:
         """The logged channels whose names fit."""

@@ -21,6 +21,7 @@ from magtensor.errors import NotEnoughData, UsageError
 from magtensor.loop.assessment import Colours, colours_of, estimated, log_likelihood
 from magtensor.loop.excitation import Excitation
 from magtensor.loop.residual import Residual, residual_of, taken_off
+from magtensor.loop.station import Station
 from magtensor.loop.statistics import Estimate
 from magtensor.loop.stretches import borne_out
 from magtensor.loop.terms import Terms, joined
@@ -46,6 +47,7 @@ class Record:
         position: (S, 3) m or None; attitude: (N, 4) or None.
         samples: (N,) their numbers in the survey.
         waveform: (N,) of a source that nobody logged, once it was found.
+        station: the base station's own readings without their noise; None where only `total_field` is known.
         courses: of its thermometers, as in Excitation.
     """
 
@@ -64,6 +66,7 @@ class Record:
     attitude: Array | None
     samples: NDArray[np.int_]
     waveform: Array | None = None
+    station: Station | None = None
     courses: dict[str, tuple[Array, Array]] = field(default_factory=dict, compare=False, repr=False)
 
     def at(self, keep: NDArray[np.int_]) -> Record:
@@ -87,7 +90,8 @@ class Record:
         """What error models see, given the modelled outputs and fields (N, S, 3)."""
         return Excitation(
             self.time, self.start, self.sensors, output, field_, self.quiet_field, self.logged, self.units, self.run,
-            self.segment, self.position, self.attitude, tuple(lines), self.waveform, courses=self.courses,
+            self.segment, self.position, self.attitude, tuple(lines), self.waveform, station=self.station,
+            courses=self.courses,
         )  # fmt: skip
 
 

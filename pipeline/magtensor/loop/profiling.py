@@ -192,7 +192,12 @@ def refined(model: Component, settings: dict[str, Any], state: State, failed: di
             found = terms_of(model, {**rest, name: value}, state.excitation, failed)
             return -np.inf if found is None else score(found.at(few[0].samples))
 
-        best = golden(gain, low, high, settings[name])
+        best = settings[name]
+        finer = grid.between(low, high) if isinstance(grid, Range) else []
+        if len(finer) > 1:
+            best = max([best, *finer], key=gain)
+            low, high = best - (finer[1] - finer[0]), best + (finer[1] - finer[0])
+        best = golden(gain, low, high, best)
         if low <= 0.0 <= high and _of_ratios(grid) and gain(best) - gain(0.0) < SEPARATION / 2.0:
             best = 0.0
         settings = {**settings, name: best}
@@ -202,7 +207,8 @@ def refined(model: Component, settings: dict[str, Any], state: State, failed: di
 def _about_what_it_fits(
     model: Component, settings: dict[str, Any], state: State, failed: dict[str, str]
 ) -> dict[str, Any]:
-    """Settings about which a model is linear, moved to where its coefficients are, unless it explains far less there.
+    """Settings about which a model is linear, moved to where its coefficients are, unless that leads away from where
+    they agree, or the model explains far less there.
 
     In white noise: what is slow determines such coefficients, and the noise of the regressors themselves is fast. Of a
     delay, the lag that it is sought about hardly matters; if it matters, it is noise of the regressor.
@@ -217,14 +223,19 @@ def _about_what_it_fits(
     first = terms = at(settings)
     assert model.about is not None
     moved = settings
+    last = np.inf
     for _ in range(_REFINEMENTS):
         if terms is None:
             return settings
         together = terms if given is None else joined([given, terms])
         theta = estimated(residual, together, WHITE).theta[together.count - terms.count :]
-        moved, before = dict(model.about(moved, theta)), moved
-        if moved == before:
+        before, moved = moved, dict(model.about(moved, theta))
+        step = max((abs(moved[name] - before[name]) for name in moved if moved[name] != before[name]), default=0.0)
+        if step == 0:
             break
+        if step >= last:
+            return settings
+        last = step
         terms = at(moved)
     return moved if first is not None and terms is not None and score(terms) >= MOST_OF_IT * score(first) else settings
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from magtensor.calibration.types import Array
 from magtensor.loop.model import Record
 from magtensor.loop.quiet import quieted
+from magtensor.loop.station import Station
 from magtensor.survey.model import Survey
 
 NOT_CHANNELS = (
@@ -60,12 +61,14 @@ def record_of(
     if not steady:  # what never changes says nothing
         centred = {n: v for n, v in centred.items() if np.ptp(v[keep], axis=0).max(initial=0.0) > 0}
     segment = np.asarray(survey.values("segment"), dtype=int) if "segment" in survey else np.zeros(len(time), dtype=int)
+    station = _station(survey)
     whole = Record(
         time=time,
         start=float(time[0]),
         raw=raw,
         total_field=total_field,
-        quiet_field=_quiet(survey, time, total_field),
+        quiet_field=_quiet(station, time, total_field),
+        station=None if total_field is None else station,
         sensors=tuple(survey.sensors),
         logged=centred,
         means={n: means[n] for n in centred},
@@ -106,20 +109,24 @@ def runs(time: Array, segment: NDArray[np.int_]) -> NDArray[np.int_]:
     return np.concatenate([[0], np.cumsum(breaks)])
 
 
-def _quiet(survey: Survey, time: Array, total_field: Array | None) -> Array | None:
-    """The total field without the base station's own noise, at the survey's times."""
-    if total_field is None:
+def _station(survey: Survey) -> Station | None:
+    """The base station's readings without their noise; None where the survey holds none."""
+    if not {"total_field", "reference/total_field", "reference/time"} <= set(survey.paths()):
         return None
-    if "reference/total_field" not in survey or "reference/time" not in survey:
-        return total_field
     at = np.asarray(survey.values("reference/time"), dtype=float)
     values = np.asarray(survey.values("reference/total_field"), dtype=float)
     known = np.isfinite(at) & np.isfinite(values)
     if known.sum() < 2:
-        return total_field
+        return None
     latency = float(survey["total_field"].attrs.get("latency_s", 0.0))
-    smooth = np.interp(time, at[known] - latency, quieted(values[known], CLEARANCE))
-    return np.where(np.isfinite(total_field), smooth, np.nan)
+    return Station(at[known] - latency, quieted(values[known], CLEARANCE))
+
+
+def _quiet(station: Station | None, time: Array, total_field: Array | None) -> Array | None:
+    """The total field without the base station's own noise, at the survey's times."""
+    if total_field is None or station is None:
+        return total_field
+    return np.where(np.isfinite(total_field), station.at(time), np.nan)
 
 
 def _filled(time: Array, values: Array, finite: NDArray[np.bool_]) -> Array:

@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from magtensor.components import Component
     from magtensor.loop.excitation import Excitation
 
+_LEAST_REACH = 0.8  # of the samples
+
 
 @dataclass(frozen=True)
 class Range:
@@ -36,6 +38,10 @@ class Range:
     of_duration: bool = False
     sampled: bool = False
 
+    def between(self, low: float, high: float) -> list[float]:
+        """Values between two neighbours of the grid, where more than one could be the best there; none."""
+        return []
+
     def values(self, x: Excitation) -> list[Any]:
         """The grid for a survey."""
         least = x.spacing if self.sampled else -np.inf
@@ -48,6 +54,30 @@ class Range:
         first = low if low > 0 else high / 10 ** (self.count / 4)
         grid = [float(v) for v in np.geomspace(first, high, self.count - (low <= 0))]
         return [-v for v in grid[::-1] if v <= -low] + [0.0, *grid] if low <= 0 else grid
+
+
+@dataclass(frozen=True)
+class Delays(Range):
+    """Delays of the base station, s, that its readings can show: they reach all but a fifth of the samples then.
+
+    Attributes:
+        evenly: s, so far `count` values lie evenly; beyond it each is half as long again, and whole hours.
+    """
+
+    evenly: float = 120.0
+
+    def values(self, x: Excitation) -> list[Any]:
+        """The grid for a survey."""
+        even = np.linspace(-self.evenly, self.evenly, self.count)
+        longer = [*self.evenly * 1.5 ** np.arange(1.0, 20.0), *np.arange(3600.0, self.high + 1.0, 3600.0)]
+        grid = sorted({*even, *longer, *(-v for v in longer)})
+        within = (float(v) for v in grid if self.low <= v <= self.high)
+        return [v for v in within if x.readings.reach(x.time + v) >= _LEAST_REACH]
+
+    def between(self, low: float, high: float) -> list[float]:
+        """Values between two of the grid, as near to each other as the even ones, which pulsations need."""
+        step = 2.0 * self.evenly / (self.count - 1)
+        return [float(v) for v in np.linspace(low, high, max(round((high - low) / step), 1) + 1)[1:-1]]
 
 
 @dataclass(frozen=True)
