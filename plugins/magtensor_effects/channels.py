@@ -8,13 +8,18 @@ from pydantic import Field
 from magtensor.calibration.types import Array
 from magtensor.components import error_model
 from magtensor.loop.excitation import AXES, Excitation
-from magtensor.loop.settings import AnyChannel, Choice, Frequencies, Range
+from magtensor.loop.settings import AnyChannel, Choice, Forms, Frequencies, Range
 from magtensor.loop.terms import Terms, joined
 from magtensor.units import convert
 
 ATTITUDE_ANGLES = ("roll*", "pitch*", "yaw*", "heading*", "azimuth*", "course*", "latitude*", "longitude*")
 ENCODER = AnyChannel("encoder*", without=ATTITUDE_ANGLES, or_units="rad", vectors=False)
 ANY = AnyChannel("*")
+Delayed = Annotated[
+    bool,
+    Forms((False, True)),
+    Field(description="true: later than the channel by lag_s, unchanged; false: behind it with a time constant lag_s"),
+]
 
 
 @error_model("instrument", needs=("encoder*",), source="rotating dipole", typical="100 nT for 1 A m2 at 1 m")
@@ -62,8 +67,9 @@ def channel_response(
     lag_s: Annotated[
         float,
         Range(0.0, 300.0, count=5, spacing="log"),
-        Field(ge=0, description="time constant of the response behind the channel, s"),
+        Field(ge=0, description="how far the response is behind the channel, s"),
     ] = 0.0,
+    delayed: Delayed = False,
     times_field: Annotated[
         bool,
         Choice((False, True)),
@@ -77,7 +83,7 @@ def channel_response(
     one at power 1.
     """
     name = ANY.pick(x, channel)
-    course = x.channel(name, lag_s) ** power
+    course = x.channel(name, lag_s, delayed) ** power
     per_unit = f"({x.units[name]})^{power}" if power > 1 else x.units[name]
     if not x.is_vector(name):
         return x.scales(1e-6 * course, f"ppm/{per_unit}") if times_field else x.offsets(course, f"nT/{per_unit}")

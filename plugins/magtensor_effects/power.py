@@ -8,6 +8,7 @@ from magtensor.components import error_model
 from magtensor.loop.excitation import Excitation
 from magtensor.loop.settings import AnyChannel, Range
 from magtensor.loop.terms import Terms
+from magtensor_effects.channels import Delayed
 
 CURRENT = AnyChannel("current_*", or_units="A", vectors=False)
 SUPPLY = AnyChannel("supply*", or_units="V", vectors=False)
@@ -29,8 +30,9 @@ def current_field(
     lag_s: Annotated[
         float,
         Range(-2.0, 10.0, count=6, spacing="log"),
-        Field(description="time constant of the current behind the logged one, s; below 0 the log is so much late"),
+        Field(description="how far the current is behind the logged one, s; below 0 the log is so much late"),
     ] = 0.0,
+    delayed: Delayed = False,
 ) -> Terms:
     """The magnetic field of a logged current: a constant vector at each sensor, in proportion to it.
 
@@ -38,7 +40,7 @@ def current_field(
     is given). Rivals: other currents that switch together; `supply_offset`, for the supply sags under the current.
     """
     name = CURRENT.pick(x, channel)
-    return x.offsets(x.channel(name, lag_s), f"nT/{x.units[name]}")
+    return x.offsets(x.channel(name, lag_s, delayed), f"nT/{x.units[name]}")
 
 
 @error_model("instrument", needs=("supply*",), source="dependence of the excitation on the supply", typical="10 ppm/V")

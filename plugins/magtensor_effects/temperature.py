@@ -8,6 +8,7 @@ from magtensor.components import error_model
 from magtensor.loop.excitation import Excitation
 from magtensor.loop.settings import AnyChannel, Orders, Range
 from magtensor.loop.terms import Terms, joined
+from magtensor_effects.channels import Delayed
 
 THERMOMETER = AnyChannel("temperature*", or_units="degC", vectors=False)
 
@@ -18,7 +19,7 @@ Order = Annotated[int, Orders((1, 2)), Field(ge=1, le=2, description="highest po
 ThermalLag = Annotated[
     float,
     Range(0.0, 600.0, count=8, spacing="log"),
-    Field(ge=0, description="time constant of the sensor behind the thermometer, s"),
+    Field(ge=0, description="how far the sensor is behind the thermometer, s"),
 ]
 
 
@@ -29,7 +30,9 @@ ThermalLag = Annotated[
     typical="0.1 nT/degC for a good fluxgate; thermal lags of minutes",
     pointwise=True,
 )
-def temperature_offset(x: Excitation, *, order: Order = 1, channel: Thermometer = "", lag_s: ThermalLag = 0.0) -> Terms:
+def temperature_offset(
+    x: Excitation, *, order: Order = 1, channel: Thermometer = "", lag_s: ThermalLag = 0.0, delayed: Delayed = False
+) -> Terms:
     """Each axis's offset follows the temperature of the sensor, which lags the thermometer.
 
     The thermometer is seen through a first-order lag, also across gaps in the recording. One coefficient an axis and
@@ -38,7 +41,7 @@ def temperature_offset(x: Excitation, *, order: Order = 1, channel: Thermometer 
     short lags.
     """
     name = THERMOMETER.pick(x, channel)
-    course = x.thermometer(name, lag_s)
+    course = x.thermometer(name, lag_s, delayed)
     return joined([x.offsets(course**k, f"nT/{units}", label) for k, units, label in _powers(x.units[name], order)])
 
 
@@ -49,14 +52,16 @@ def temperature_offset(x: Excitation, *, order: Order = 1, channel: Thermometer 
     typical="20 ppm/degC for a fluxgate, 100 for an orthogonal one, below 1 for Swarm after correction",
     pointwise=True,
 )
-def temperature_scale(x: Excitation, *, order: Order = 1, channel: Thermometer = "", lag_s: ThermalLag = 0.0) -> Terms:
+def temperature_scale(
+    x: Excitation, *, order: Order = 1, channel: Thermometer = "", lag_s: ThermalLag = 0.0, delayed: Delayed = False
+) -> Terms:
     """Each axis's scale factor follows the temperature of the sensor, which lags the thermometer.
 
     The lagged temperature times the axis's own output. One coefficient an axis and power. Rivals:
     `temperature_offset` where the attitude hardly changes; `scale_drift` where the temperature rises steadily.
     """
     name = THERMOMETER.pick(x, channel)
-    course = x.thermometer(name, lag_s)
+    course = x.thermometer(name, lag_s, delayed)
     powers = _powers(x.units[name], order)
     return joined([x.scales(1e-6 * course**k, f"ppm/{units}", label) for k, units, label in powers])
 

@@ -53,6 +53,17 @@ def test_all_samples_determine_the_coefficients_of_what_a_part_shows(tmp_path: P
     assert np.median(ratio) == pytest.approx(2.0, rel=0.15)
 
 
+@pytest.mark.parametrize("periods", [277.0, 277.5, 1190.3], ids=["whole", "half", "near the end of the band"])
+def test_the_frequency_of_a_tone_is_found_between_the_lines_of_a_spectrum(periods: float, tmp_path: Path) -> None:
+    """Half a line off, three fifths of a tone's amplitude would be left."""
+    effect = {"type": "periodic_interference", "frequency_Hz": periods / 1200.0, "rms_nT": 4.0}
+    tones = [Registry.load().find("error_model", "periodic_interference")]
+    found = search(loaded(tmp_path, scenario(12, effect, **WHITE)), tones, HOW)
+    (tone,) = found.last.adopted
+    assert tone.settings["frequency_Hz"] == pytest.approx(periods / 1200.0, abs=0.003 / 1200.0)
+    assert found.last.residual.square() == pytest.approx(1.0, abs=0.1)
+
+
 def test_a_tone_too_fast_for_the_part_keeps_its_frequency(tmp_path: Path) -> None:
     """0.83 Hz at 0.5 samples a second looks like 0.17 Hz."""
     whole = found_in_a_part(tmp_path, "periodic_interference", type="periodic_interference", frequency_Hz=0.83)

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 
 from magtensor.loop.assessment import estimated, explained
@@ -10,9 +14,11 @@ from magtensor.loop.gates import Candidate
 from magtensor.loop.model import Adopted, Fitting, Record, State, joint_state
 from magtensor.loop.profiling import golden
 from magtensor.loop.scoring import Scorer
-from magtensor.loop.settings import Range, profiled
+from magtensor.loop.separation import SEPARATION
+from magtensor.loop.settings import Forms, Frequencies, Range, profiled
 
-POLISH = 0.1  # of a setting, to either side
+POLISH = 0.1  # of a setting, or of the width of a line, to either side
+FORM = 0.3  # of a setting in the form that was searched with: where the same in another form may begin
 _SWEEPS = 6  # over all settings, where two models of one kind are in
 _RESTS = 0.02  # relative: a setting that moves no further is settled
 
@@ -102,31 +108,65 @@ def _sensors_showing(state: State, which: int) -> tuple[str, ...] | None:
 
 
 def polished(record: Record, state: State, how: Fitting) -> State:
-    """The settings on a range, sought once more now that everything is fitted together; a setting that is a little
-    off leaves a residual that another model would be adopted for."""
+    """The forms of the models and their settings on a range, sought once more now that everything is fitted together; a
+    setting that is a little off leaves a residual that another model would be adopted for."""
+    state = _in_their_forms(record, state, how)
     for _ in range(_SWEEPS):
         moved = False
         for number, model in enumerate(state.adopted):
             for name, grid in profiled(model.component).items():
-                if not isinstance(grid, Range) or not state.adopted[number].settings[name]:
+                if not isinstance(grid, (Range, Frequencies)) or not state.adopted[number].settings[name]:
                     continue
                 here = float(state.adopted[number].settings[name])
-                best = _sought_anew(state, number, name)
+                whole = abs(here) if isinstance(grid, Range) else 1.0 / state.excitation.duration
+                gain = _gain_beside_the_others(state, number)
+                best = _near(gain, state.adopted[number].settings, name, here - POLISH * whole)
                 if best == here:
                     continue
                 moved |= abs(best - here) > _RESTS * abs(here)
-                now = state.adopted[number]
-                changed = Adopted(now.component, {**now.settings, name: best}, now.sensors)
-                models = [changed if i == number else a for i, a in enumerate(state.adopted)]
-                state = joint_state(record, models, how, state.theta)
+                state = _changed(record, state, number, {name: best}, how)
         # one setting of a kind rests at once; of two, one moves as the other does
         if not moved or len({a.name for a in state.adopted}) == len(state.adopted):
             break
     return state
 
 
-def _sought_anew(state: State, number: int, name: str) -> float:
-    """A setting of one of the adopted models near where it is, by what the model explains beside the others."""
+def _in_their_forms(record: Record, state: State, how: Fitting) -> State:
+    """Every model in the form, with the settings on a range that suit it, which the data separate from all others."""
+    for number, model in enumerate(state.adopted):
+        grids = profiled(model.component)
+        ranges = [n for n, grid in grids.items() if isinstance(grid, Range) and model.settings[n] > 0]
+        if not ranges:
+            continue  # without a lag all forms are one
+        gain = _gain_beside_the_others(state, number)
+        best, most = dict(model.settings), gain(model.settings)
+        for name, grid in grids.items():
+            for form in grid.options if isinstance(grid, Forms) else ():
+                changed = {**model.settings, name: form}
+                for other in ranges:
+                    changed[other] = _near(gain, changed, other, FORM * changed[other])
+                if form != model.settings[name] and gain(changed) > most + SEPARATION / 2.0:
+                    best, most = changed, gain(changed)
+        if best != model.settings:
+            state = _changed(record, state, number, best, how)
+    return state
+
+
+def _changed(record: Record, state: State, number: int, settings: Mapping[str, Any], how: Fitting) -> State:
+    """Refit with other settings of one of the models."""
+    models = list(state.adopted)
+    models[number] = replace(models[number], settings={**models[number].settings, **settings})
+    return joint_state(record, models, how, state.theta)
+
+
+def _near(gain: Callable[[Mapping[str, Any]], float], settings: Mapping[str, Any], name: str, low: float) -> float:
+    """The best value of a setting as far from where it is as `low` is."""
+    here = float(settings[name])
+    return golden(lambda value: gain({**settings, name: value}), low, 2.0 * here - low, here)
+
+
+def _gain_beside_the_others(state: State, number: int) -> Callable[[Mapping[str, Any]], float]:
+    """What one of the adopted models explains beside the others, for given settings."""
     now = state.adopted[number]
     own = slices(state)[number]
     assert state.terms is not None
@@ -135,9 +175,8 @@ def _sought_anew(state: State, number: int, name: str) -> float:
     back = put_back(state.residual, mine, state.theta[number])
     score = Scorer(back, state.terms.only(others) if others else None, state.colours)
 
-    def gain(value: float) -> float:
-        changed = Adopted(now.component, {**now.settings, name: value}, now.sensors)
+    def gain(settings: Mapping[str, Any]) -> float:
+        changed = replace(now, settings=settings)
         return score(changed.terms(state.excitation).at(state.residual.samples))
 
-    here = float(now.settings[name])
-    return golden(gain, here - POLISH * abs(here), here + POLISH * abs(here), here)
+    return gain

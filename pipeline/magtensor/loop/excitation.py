@@ -116,29 +116,30 @@ class Excitation:
         """The logged channels whose names fit."""
         return sorted(n for n in self.logged if fnmatchcase(n, pattern) and not any(fnmatchcase(n, w) for w in without))
 
-    def channel(self, name: str, lag_s: float = 0.0) -> Array:
-        """A logged channel, (N,), (N, S) or (N, 3), seen through a lag as in `lagged`.
+    def channel(self, name: str, lag_s: float = 0.0, delayed: bool = False) -> Array:
+        """A logged channel, (N,), (N, S) or (N, 3), seen through a lag as in `lagged`, or later by it as a whole.
 
         Raises:
             KeyError: there is none of that name.
         """
         if name not in self.logged:
             raise KeyError(f"no channel {name}{did_you_mean(name, self.logged)}")
-        return self._course(name, lag_s, smooth=False) if lag_s else self.logged[name]
+        return self._course(name, lag_s, delayed, smooth=False) if lag_s else self.logged[name]
 
-    def thermometer(self, name: str, lag_s: float = 0.0) -> Array:
-        """A logged temperature without the noise of its log, seen through a lag: what has a thermal mass does not jump,
-        neither between samples nor where a log that is written seldom has a new value."""
-        return self._course(name, lag_s, smooth=True)
+    def thermometer(self, name: str, lag_s: float = 0.0, delayed: bool = False) -> Array:
+        """A logged temperature without the noise of its log, seen through a lag as in `channel`: what has a thermal
+        mass does not jump, neither between samples nor where a log that is written seldom has a new value."""
+        return self._course(name, lag_s, delayed, smooth=True)
 
-    def _course(self, name: str, lag_s: float, smooth: bool) -> Array:
+    def _course(self, name: str, lag_s: float, delayed: bool, smooth: bool) -> Array:
         if self.part_of is not None:
             whole, samples = self.part_of
-            return whole._course(name, lag_s, smooth)[samples]
-        key = name, lag_s, smooth
+            return whole._course(name, lag_s, delayed, smooth)[samples]
+        key = name, lag_s, delayed, smooth
         if key not in self._lagged:
             values = self._without_noise(name) if smooth else self.channel(name)
-            self._lagged[key] = self.lagged(values, lag_s) if lag_s else values
+            seen = self.later if delayed else self.lagged
+            self._lagged[key] = seen(values, lag_s) if lag_s else values
         return self._lagged[key]
 
     def _without_noise(self, name: str) -> Array:
@@ -154,7 +155,7 @@ class Excitation:
         return len(shape) == 2 and shape[1] == 3 and (len(self.sensors) != 3 or name in VECTORS)
 
     @cached_property
-    def _lagged(self) -> dict[tuple[str, float, bool], Array]:
+    def _lagged(self) -> dict[tuple[str, float, bool, bool], Array]:
         return {}
 
     @cached_property
@@ -230,11 +231,17 @@ class Excitation:
     def lagged(self, series: Array, tau: float) -> Array:
         """As `relaxed`, but straight across gaps: for what goes on between recordings, such as a temperature.
 
-        A tau below 0 is the delay of a log that is late, and the series (N,) is taken so much later; held at the end.
+        A tau below 0 is the delay of a log that is late: the series comes so much earlier.
         """
         if tau < 0:
-            return np.interp(self.time - tau, self.time, series)
+            return self.later(series, tau)
         return _first_order(self.time, np.asarray(series, dtype=float), tau) if tau > 0 else series
+
+    def later(self, series: Array, delay: float) -> Array:
+        """A series (N, ...) later by a delay, s, or earlier where that is below 0; held beyond its ends."""
+        flat = np.asarray(series, dtype=float).reshape(len(self.time), -1)
+        moved = [np.interp(self.time - delay, self.time, column) for column in flat.T]
+        return np.column_stack(moved).reshape(np.shape(series))
 
     def relaxed(self, series: Array, tau: float) -> Array:
         """A series (N, ...) seen through a first-order lag tau, s, exact for samples joined by straight lines.

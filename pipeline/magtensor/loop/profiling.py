@@ -27,6 +27,7 @@ REFINING_SAMPLES = 6000  # and the best of them refined on so many
 BATCH_ENTRIES = 130_000  # numbers in the series that are worked on together
 MOST_OF_IT = 0.75  # of what a model explains, if it is to be made about other settings
 _REFINEMENTS = 8
+_OF_A_LINE = 16  # to a thousandth of its width
 
 
 def repeatable(model: Component) -> bool:
@@ -175,11 +176,9 @@ def refined(model: Component, settings: dict[str, Any], state: State, failed: di
     one where the data do not separate the two."""
     few = thinned(state, REFINING_SAMPLES)
     for name, grid in profiled(model).items():
-        if not isinstance(grid, (Range, EventTimes)):
+        if not isinstance(grid, (Range, EventTimes, Frequencies)):
             continue
-        values = sorted(grid.values(state.excitation))
-        place = int(np.argmin(np.abs(np.array(values) - settings[name])))
-        low, high = values[max(place - 1, 0)], values[min(place + 1, len(values) - 1)]
+        low, high = _around(grid, settings[name], state.excitation)
         terms = terms_of(model, settings, state.excitation, failed)
         if terms is None or high <= low:
             continue
@@ -197,11 +196,20 @@ def refined(model: Component, settings: dict[str, Any], state: State, failed: di
         if len(finer) > 1:
             best = max([best, *finer], key=gain)
             low, high = best - (finer[1] - finer[0]), best + (finer[1] - finer[0])
-        best = golden(gain, low, high, best)
+        best = golden(gain, low, high, best, _OF_A_LINE if isinstance(grid, Frequencies) else _REFINEMENTS)
         if low <= 0.0 <= high and _of_ratios(grid) and gain(best) - gain(0.0) < SEPARATION / 2.0:
             best = 0.0
         settings = {**settings, name: best}
     return _about_what_it_fits(model, settings, state, failed) if model.about is not None else settings
+
+
+def _around(grid: Range | EventTimes | Frequencies, value: float, x: Excitation) -> tuple[float, float]:
+    """Between which limits the best of a grid is refined: its neighbours, or the width of a line."""
+    if isinstance(grid, Frequencies):
+        return value - 1.0 / x.duration, value + 1.0 / x.duration
+    values = sorted(grid.values(x))
+    place = int(np.argmin(np.abs(np.array(values) - value)))
+    return values[max(place - 1, 0)], values[min(place + 1, len(values) - 1)]
 
 
 def _about_what_it_fits(
@@ -240,13 +248,13 @@ def _about_what_it_fits(
     return moved if first is not None and terms is not None and score(terms) >= MOST_OF_IT * score(first) else settings
 
 
-def golden(f: Callable[[float], float], low: float, high: float, best: float) -> float:
+def golden(f: Callable[[float], float], low: float, high: float, best: float, steps: int = _REFINEMENTS) -> float:
     """Where f is largest between two limits, by golden section; `best` if nothing exceeds f there."""
     ratio = (np.sqrt(5.0) - 1) / 2
     a, b = low, high
     c, d = b - ratio * (b - a), a + ratio * (b - a)
     fc, fd, known = f(c), f(d), f(best)
-    for _ in range(_REFINEMENTS):
+    for _ in range(steps):
         if fc > fd:
             b, d, fd = d, c, fc
             c = b - ratio * (b - a)

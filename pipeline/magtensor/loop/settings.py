@@ -154,6 +154,16 @@ class Choice:
 
 
 @dataclass(frozen=True)
+class Forms(Choice):
+    """Forms of the same response, alike in what they explain: the first is searched with, and an adopted model is given
+    another one where the data separate the two."""
+
+    def values(self, x: Excitation) -> list[Any]:
+        """The first."""
+        return list(self.options[:1])
+
+
+@dataclass(frozen=True)
 class Orders(Choice):
     """Numbers of which a higher one keeps all coefficients of a lower one and adds some.
 
