@@ -108,7 +108,8 @@ def _in_words(mark: object) -> str:
         share = " of the survey's duration" if mark.of_duration else ""
         return f"{mark.low:g} to {mark.high:g}{share} in {mark.count} {mark.spacing} steps, the best refined"
     if isinstance(mark, Forms):
-        return f"{mark.options[0]!r}; {' or '.join(repr(o) for o in mark.options[1:])} once it is adopted, if that is better"
+        others = " or ".join(repr(o) for o in mark.options[1:])
+        return f"{mark.options[0]!r}; {others} once it is adopted, if that is better"
     if isinstance(mark, Choice):
         return ", ".join(repr(o) for o in mark.options)
     if isinstance(mark, AnyChannel):

@@ -21,6 +21,14 @@ Delayed = Annotated[
     Field(description="true: later than the channel by lag_s, unchanged; false: behind it with a time constant lag_s"),
 ]
 
+Smooth = Annotated[
+    bool,
+    Forms((False, True)),
+    Field(
+        description="true: without the noise of the channel's log, as far as its smooth course tells; false: as logged"
+    ),
+]
+
 
 @error_model("instrument", needs=("encoder*",), source="rotating dipole", typical="100 nT for 1 A m2 at 1 m")
 def moving_part(
@@ -69,6 +77,7 @@ def channel_response(
         Range(0.0, 300.0, count=5, spacing="log"),
         Field(ge=0, description="how far the response is behind the channel, s"),
     ] = 0.0,
+    smooth: Smooth = False,
     delayed: Delayed = False,
     times_field: Annotated[
         bool,
@@ -83,7 +92,7 @@ def channel_response(
     one at power 1.
     """
     name = ANY.pick(x, channel)
-    course = x.channel(name, lag_s, delayed) ** power
+    course = x.channel(name, lag_s, delayed, smooth) ** power
     per_unit = f"({x.units[name]})^{power}" if power > 1 else x.units[name]
     if not x.is_vector(name):
         return x.scales(1e-6 * course, f"ppm/{per_unit}") if times_field else x.offsets(course, f"nT/{per_unit}")

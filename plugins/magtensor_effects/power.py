@@ -8,7 +8,7 @@ from magtensor.components import error_model
 from magtensor.loop.excitation import Excitation
 from magtensor.loop.settings import AnyChannel, Range
 from magtensor.loop.terms import Terms
-from magtensor_effects.channels import Delayed
+from magtensor_effects.channels import Delayed, Smooth
 
 CURRENT = AnyChannel("current_*", or_units="A", vectors=False)
 SUPPLY = AnyChannel("supply*", or_units="V", vectors=False)
@@ -32,6 +32,7 @@ def current_field(
         Range(-2.0, 10.0, count=6, spacing="log"),
         Field(description="how far the current is behind the logged one, s; below 0 the log is so much late"),
     ] = 0.0,
+    smooth: Smooth = False,
     delayed: Delayed = False,
 ) -> Terms:
     """The magnetic field of a logged current: a constant vector at each sensor, in proportion to it.
@@ -40,26 +41,26 @@ def current_field(
     is given). Rivals: other currents that switch together; `supply_offset`, for the supply sags under the current.
     """
     name = CURRENT.pick(x, channel)
-    return x.offsets(x.channel(name, lag_s, delayed), f"nT/{x.units[name]}")
+    return x.offsets(x.channel(name, lag_s, delayed, smooth), f"nT/{x.units[name]}")
 
 
 @error_model("instrument", needs=("supply*",), source="dependence of the excitation on the supply", typical="10 ppm/V")
-def supply_scale(x: Excitation, *, channel: Supply = "") -> Terms:
+def supply_scale(x: Excitation, *, channel: Supply = "", smooth: Smooth = False) -> Terms:
     """Each axis's scale factor follows the supply voltage.
 
     The voltage times the axis's own output. Rivals: `supply_offset` where the attitude hardly changes;
     `scale_drift` for a battery that discharges steadily.
     """
     name = SUPPLY.pick(x, channel)
-    return x.scales(1e-6 * x.channel(name), f"ppm/{x.units[name]}")
+    return x.scales(1e-6 * x.channel(name, smooth=smooth), f"ppm/{x.units[name]}")
 
 
 @error_model("instrument", needs=("supply*",), source="dependence of the electronics on the supply", typical="a nT/V")
-def supply_offset(x: Excitation, *, channel: Supply = "") -> Terms:
+def supply_offset(x: Excitation, *, channel: Supply = "", smooth: Smooth = False) -> Terms:
     """Each axis's offset follows the supply voltage.
 
     Rivals: `current_field` of the current under which the supply sags; `supply_scale` where the attitude hardly
     changes; `offset_drift` for a battery that discharges steadily.
     """
     name = SUPPLY.pick(x, channel)
-    return x.offsets(x.channel(name), f"nT/{x.units[name]}")
+    return x.offsets(x.channel(name, smooth=smooth), f"nT/{x.units[name]}")

@@ -92,13 +92,14 @@ def reference_clock(
 def reference_drift(x: Excitation, *, order: Order = 1, span_s: Span = 3600.0) -> Terms:
     """The base station's total field drifts.
 
-    Legendre polynomials of time over span_s: the coefficient of P1 is half the change from the start to the end. Common
-    to all sensors, so the tensor does not feel it. Rival: `scale_drift` with one course for all axes of all sensors,
+    Legendre polynomials of time over span_s, less their values at the start, when the station is taken to be right: the
+    coefficient of P1 is half the change from the start to the end. Common to all sensors, so the tensor does not feel
+    it. Rival: `scale_drift` with one course for all axes of all sensors,
     which nothing but another reference would tell from it.
     """
     _total_field(x)
     named = enumerate(courses(x, order, span_s), start=1)
-    return joined([x.on_reference(course, "nT", f"P{k}") for k, course in named])
+    return joined([x.on_reference(course - (-1.0) ** k, "nT", f"P{k}") for k, course in named])
 
 
 @error_model(

@@ -91,12 +91,13 @@ def detrend_diurnal(
     else:
         value = float(base)
     facts = {"units": "nT", "origin": origin}
+    made: dict[str, Any] = {"interpolation": interpolation, "latency_s": latency_s, "base_nT": value}
+    if despike is not None:
+        made["despike"] = despike
     variables: dict[str, Any] = {
-        "total_field": (
-            ("time",), field, {**facts, "interpolation": interpolation, "latency_s": latency_s, "base_nT": value},
-        ),
+        "total_field": (("time",), field, {**facts, **made}),
         "diurnal": (("time",), field - value, {**facts, "base_nT": value, "long_name": "variation of the total field"}),
-    }  # fmt: skip
+    }
     if origin == "measured":
         std = reference.noise(values) * found.weight_norm
         variables["total_field_std"] = (("time",), np.where(found.covered, std, np.nan), {"units": "nT"})

@@ -1,4 +1,4 @@
-"""A base station whose stamps are late: the delay is found whatever lag it is sought about first."""
+"""A base station whose stamps are late, or whose readings jump or wander: its faults are not blamed on another."""
 
 from __future__ import annotations
 
@@ -44,3 +44,16 @@ def test_slow_noise_of_the_base_station_is_no_delay(tmp_path: Path) -> None:
 
     told = verdict_of(tmp_path, scenario(43), wandering, ["reference_clock", "offset_drift"])
     assert "reference_clock" not in {a["error_model"] for a in told["adopted"]}
+
+
+def test_spikes_of_the_base_station_are_left_out(tmp_path: Path) -> None:
+    def spiky(path: Path) -> None:
+        rng = np.random.default_rng(5)
+        with h5py.File(path, "a") as file:
+            field = file["reference/total_field"]
+            values = field[:]
+            values[rng.choice(len(values), 6, replace=False)] += 20.0 * rng.standard_normal(6)
+            field[:] = values
+
+    told = verdict_of(tmp_path, scenario(45), spiky, ["reference_clock", "reference_scale", "passing_source"])
+    assert not told["adopted"] and not told["unexplained"]["present"], told["unexplained"]["description"]

@@ -142,6 +142,16 @@ def test_spikes() -> None:
     assert np.abs(values(detrend_diurnal(survey_with(time, spiky)), "total_field") - true).max() > 200
 
 
+def test_some_minutes_of_pulsations_are_no_spikes() -> None:
+    time = np.arange(0.0, 3600.0, 5.0)
+    rng = np.random.default_rng(3)
+    active = np.where((time > 1200) & (time < 1800), 20 * np.sin(2 * np.pi * time / 25.0), 0.0)
+    record = 48_000 + active + 0.05 * rng.normal(size=len(time))
+    assert not spikes(record, 8.0).any()
+    record[[100, 500]] += 5.0
+    assert np.flatnonzero(spikes(record, 8.0)).tolist() == [100, 500]
+
+
 def test_the_reference_s_noise_is_carried() -> None:
     rng = np.random.default_rng(2)
     time = np.arange(-5.0, 50.0, 0.05)

@@ -18,7 +18,6 @@ from magtensor.loop.separation import SEPARATION
 from magtensor.loop.settings import Forms, Frequencies, Range, profiled
 
 POLISH = 0.1  # of a setting, or of the width of a line, to either side
-FORM = 0.3  # of a setting in the form that was searched with: where the same in another form may begin
 _SWEEPS = 6  # over all settings, where two models of one kind are in
 _RESTS = 0.02  # relative: a setting that moves no further is settled
 
@@ -132,24 +131,36 @@ def polished(record: Record, state: State, how: Fitting) -> State:
 
 
 def _in_their_forms(record: Record, state: State, how: Fitting) -> State:
-    """Every model in the form, with the settings on a range that suit it, which the data separate from all others."""
+    """Every model in the forms that the data separate from others, with the settings on a range that suit these."""
     for number, model in enumerate(state.adopted):
         grids = profiled(model.component)
-        ranges = [n for n, grid in grids.items() if isinstance(grid, Range) and model.settings[n] > 0]
-        if not ranges:
-            continue  # without a lag all forms are one
+        forms = {name: grid for name, grid in grids.items() if isinstance(grid, Forms)}
+        if not forms:
+            continue
+        ranges = {name: grid for name, grid in grids.items() if isinstance(grid, Range)}
         gain = _gain_beside_the_others(state, number)
-        best, most = dict(model.settings), gain(model.settings)
-        for name, grid in grids.items():
-            for form in grid.options if isinstance(grid, Forms) else ():
-                changed = {**model.settings, name: form}
-                for other in ranges:
-                    changed[other] = _near(gain, changed, other, FORM * changed[other])
-                if form != model.settings[name] and gain(changed) > most + SEPARATION / 2.0:
-                    best, most = changed, gain(changed)
+        best = dict(model.settings)
+        for name, grid in forms.items():
+            for form in [form for form in grid.options if form != best[name]]:
+                changed = _suited(gain, {**best, name: form}, ranges)
+                if gain(changed) > gain(best) + SEPARATION / 2.0:
+                    best = changed
         if best != model.settings:
             state = _changed(record, state, number, best, how)
     return state
+
+
+def _suited(
+    gain: Callable[[Mapping[str, Any]], float], settings: dict[str, Any], ranges: Mapping[str, Range]
+) -> dict[str, Any]:
+    """Settings whose lags suit the others: up to twice as long as they are, none if the data do not separate it."""
+    for name, grid in ranges.items():
+        if settings[name] > 0:
+            settings = {**settings, name: _near(gain, settings, name, max(grid.low, 0.0))}
+            none = {**settings, name: 0.0}
+            if grid.low <= 0 and gain(settings) < gain(none) + SEPARATION / 2.0:
+                settings = none
+    return settings
 
 
 def _changed(record: Record, state: State, number: int, settings: Mapping[str, Any], how: Fitting) -> State:

@@ -12,6 +12,7 @@ from magtensor.loop.model import Record
 from magtensor.loop.quiet import quieted
 from magtensor.loop.station import Station
 from magtensor.survey.model import Survey
+from magtensor.survey.reference import spikes
 
 NOT_CHANNELS = (
     "time", "sensor", "axis", "b_raw", "position", "good", "segment", "attitude", "quaternion", "total_field",
@@ -118,8 +119,12 @@ def _station(survey: Survey) -> Station | None:
     known = np.isfinite(at) & np.isfinite(values)
     if known.sum() < 2:
         return None
-    latency = float(survey["total_field"].attrs.get("latency_s", 0.0))
-    return Station(at[known] - latency, quieted(values[known], CLEARANCE))
+    at, values = at[known], values[known]
+    made = survey["total_field"].attrs
+    if "despike" in made:
+        good = ~spikes(values, float(made["despike"]))
+        at, values = at[good], values[good]
+    return Station(at - float(made.get("latency_s", 0.0)), quieted(values, CLEARANCE))
 
 
 def _quiet(station: Station | None, time: Array, total_field: Array | None) -> Array | None:

@@ -19,7 +19,7 @@ from magtensor.loop.contribution import eliminate, without_models
 from magtensor.loop.exchange import looked_at_again, simpler
 from magtensor.loop.excitation import Excitation
 from magtensor.loop.found import Search, Step
-from magtensor.loop.gates import ALPHA, Candidate
+from magtensor.loop.gates import ALPHA, SECOND_ORDER, Candidate
 from magtensor.loop.latent import NAME, Sought, renewed, sought, tried_source
 from magtensor.loop.model import Adopted, Fitting, Record, State, joint_state
 from magtensor.loop.needs import missing
@@ -99,8 +99,11 @@ def search(
             break
         if say is not None:
             say(f"adopting {NAME}")
-        steps[-1] = replace(steps[-1], adopted=source.evidence)
         record, state, shared = source.record, source.after, None
+        last, dropped = eliminate(record, state, how, len(declared))
+        if dropped and NAME not in dropped:  # what had taken a part of the source for its own
+            record, state = renewed(record, last, how)
+        steps[-1] = replace(steps[-1], adopted=source.evidence, dropped=() if NAME in dropped else dropped)
         standing = trial(record, state, how)
     found = Search(first, _settled(record, state, how), tuple(steps), not_tested, failed, record, shared)
     found = replace(found, shared=shared or sought(found.last, record))
@@ -268,6 +271,7 @@ def _containing(best: Candidate, possible: Sequence[Candidate], state: State) ->
 def simplest(best: Candidate, possible: Sequence[Candidate], state: State) -> tuple[Candidate, tuple[str, ...]]:
     """The simplest of the models that the held-out blocks do not separate from the best, and the others' names.
 
+    Nor are two told apart by less than the next order of what both explain.
     Simplest is more of what was adopted already, with another setting; then what has the fewest coefficients.
     A model that slow noise could explain is named, and not chosen before one that it could not.
     """
@@ -278,7 +282,9 @@ def simplest(best: Candidate, possible: Sequence[Candidate], state: State) -> tu
         if other is best:
             continue
         spare = max(other.assessment.estimate.rank - best.assessment.estimate.rank, 0)
-        if not separated(reference, fold_gain(state, colours, other.terms), spare):
+        found = fold_gain(state, colours, other.terms)
+        alike = reference.over(found).total <= SECOND_ORDER * reference.total
+        if alike or not separated(reference, found, spare):
             equal.append(other)
     known = {a.name for a in state.adopted}
 

@@ -13,6 +13,7 @@ Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
 SPIKE_WINDOW = 7  # samples; three good neighbours on each side outvote a spike of up to three samples
+SPIKE_SURROUNDINGS = 31  # samples that tell what is usual where the field is active
 
 
 @dataclass(frozen=True)
@@ -67,18 +68,19 @@ def sample(at: Floats, time: Floats, values: Floats, *, smooth: bool, max_gap_s:
 def spikes(values: Floats, threshold: float) -> Bools:
     """(N,) True where a sample leaves the running median by more than `threshold` robust standard deviations.
 
-    The deviation's scale is 1.4826 times its median magnitude over the whole record, and at least the record's
-    resolution: a proton magnetometer that rounds to 0.1 nT repeats itself for long.
+    The deviation's scale is 1.4826 times its median magnitude over the whole record, or what the upper quartile of the
+    magnitudes around the sample would be the scale of, if that is larger: a few minutes of pulsations are no spikes. It
+    is at least the record's resolution: a proton magnetometer that rounds to 0.1 nT repeats itself for long.
 
     Args:
         values: (N,) finite.
         threshold: standard deviations.
     """
-    from scipy.ndimage import median_filter
+    from scipy.ndimage import median_filter, percentile_filter
 
     off = np.abs(values - median_filter(values, SPIKE_WINDOW, mode="nearest"))
-    scale = max(1.4826 * float(np.median(off)), resolution(values))
-    limit = threshold * scale
+    around = percentile_filter(off, 75, SPIKE_SURROUNDINGS, mode="nearest") / 1.1503  # of a Gaussian
+    limit = threshold * np.maximum(np.maximum(around, 1.4826 * np.median(off)), resolution(values))
     bad = off > limit
     if not bad.any() or bad.all():
         return bad
