@@ -240,7 +240,13 @@ def _told(attributes: Mapping[str, Any]) -> str:
 
 
 def verification(calibrated: Survey, path: Path | Held, planned: Plan) -> dict[str, Any]:
-    """The error blocks of another survey: with the declared model alone, and with all that was adopted."""
+    """The error blocks of another survey: with the declared model alone, and with all that was adopted.
+
+    An error of the base station may have ended with its own survey, or another station was there: if this survey's
+    total field fits better as it was read, it is judged by that, and `total_field_as_read` names what was left in.
+    """
+    from magtensor.loop.stored import stored_effects
+
     corrected = apply_to(calibrated, path, planned, uniform=True)
     after = survey_block(corrected)
     before = after
@@ -250,7 +256,21 @@ def verification(calibrated: Survey, path: Path | Held, planned: Plan) -> dict[s
     found: dict[str, Any] = {"before": before, "after": after}
     if left := corrected["calibrated/b"].attrs.get("not_taken_off"):
         found["not_taken_off"] = left
+    of_reference = [
+        a.name for a in stored_effects(calibrated, planned.registry)[0] if a.component.effect == "reference"
+    ]
+    if of_reference:
+        as_read = load_as(planned, path)["total_field"]
+        given = (["time"], as_read.values, dict(as_read.attrs))
+        block = survey_block(corrected.merged({"total_field": given}))
+        if _total_field_error(block) < _total_field_error(after):
+            found |= {"after": block, "total_field_as_read": ", ".join(of_reference)}
     return found
+
+
+def _total_field_error(block: dict[str, Any] | None) -> float:
+    value = ((block or {}).get("total_field_rms_nT") or {}).get("all")
+    return float("inf") if value is None else float(value)
 
 
 def with_declared_alone(calibrated: Survey) -> Survey:

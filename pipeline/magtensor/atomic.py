@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import platform
 import shutil
+import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -112,8 +113,11 @@ def require_writable(directory: Path) -> None:
     place = next(p for p in (Path(directory).resolve(), *Path(directory).resolve().parents) if p.exists())
     if not place.is_dir():
         raise UsageError(f"{directory}: cannot be written: {place} is no folder")
-    if not os.access(place, os.W_OK | os.X_OK):
-        raise UsageError(f"{directory}: cannot be written: no permission to write into {place}")
+    try:
+        with tempfile.TemporaryFile(dir=place):  # permissions alone do not tell: a file system may be read-only
+            pass
+    except OSError as error:
+        raise UsageError(f"{directory}: cannot be written: {place}: {error.strerror or error}") from error
 
 
 def _make(directory: Path) -> None:

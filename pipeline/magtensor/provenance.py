@@ -105,7 +105,10 @@ def facts(given: Path | Held) -> dict[str, Any]:
     """Path, SHA-256 and size of a file, or of a survey in memory."""
     if not isinstance(given, Path):
         return given.facts()
-    return {"path": str(given.resolve()), "sha256": sha256(given), "bytes": given.stat().st_size}
+    try:
+        return {"path": str(given.resolve()), "sha256": sha256(given), "bytes": given.stat().st_size}
+    except OSError as error:
+        raise DataError((error.strerror or str(error)).lower(), where=str(given)) from error
 
 
 def sha256(path: Path) -> str:

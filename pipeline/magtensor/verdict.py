@@ -113,6 +113,8 @@ def _disagreement(outcome: dict[str, Any]) -> str:
     verify, held_out = outcome["error"].get("verify"), outcome["error"].get("held_out")
     if not verify or not held_out:
         return ""
+    if as_read := verify.get("total_field_as_read"):
+        return f"; the verification survey's total field has no {as_read}: it is judged as it was read"
     key = "total_field_rms_nT"
     before, after, here = ((b or {}).get(key) or {} for b in (verify["before"], verify["after"], held_out["after"]))
     known = [v is not None for v in (before.get("all"), after.get("all"), here.get("all"))]

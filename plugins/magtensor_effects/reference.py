@@ -14,6 +14,7 @@ from magtensor.loop.settings import Delays
 from magtensor.loop.terms import Terms, joined
 from magtensor_effects.ageing import EventTime, Order, Span, courses
 
+MOST_EXCESS = 90.0  # % of the recorded variation: ten times that of the site
 NEARBY_S = 2.0  # shorter delays show as the slope over this time
 LONGEST_S = 7200.0  # two time zones
 BETWEEN_NOISE_AND_DELAY = 0.75  # of the lag: half of it is what noise makes, all of it a delay
@@ -25,9 +26,15 @@ def _total_field(x: Excitation) -> Array:
     return x.total_field
 
 
+def _seen_at_all(_: Mapping[str, Any], coefficients: Array) -> bool:
+    """Whether the site sees some of the recorded variation: noise of the base station is recorded and not there."""
+    return bool(coefficients[0] < MOST_EXCESS)
+
+
 @error_model(
     "reference",
     needs=("total_field",),
+    agrees=_seen_at_all,
     source="spatial change of the diurnal variation",
     typical="0.1 to 1 nT; some per cent of the variation over tens of km or beside a coast",
 )

@@ -11,7 +11,7 @@ from typing import Any
 import h5py
 import pytest
 
-from magtensor import provenance
+from magtensor import close_loop, provenance
 from magtensor.batch.freshness import why_run
 from magtensor.cli import status_of
 from magtensor.errors import DataError
@@ -21,6 +21,7 @@ from magtensor.session import compute, run_recipe
 from magtensor.simulate import simulate, write
 from magtensor.survey.canonical import read_canonical
 from magtensor.survey.in_memory import given_survey
+from magtensor.verdict import sentence
 
 SCENARIO: dict[str, Any] = {
     "title": "a cross of four sensors, tumbled",
@@ -166,3 +167,29 @@ def test_a_verification_survey_in_memory_is_asked_for(folder: Path) -> None:
         run_recipe(folder / "out/result.nc", folder / "again")
     run_recipe(folder / "out/result.nc", folder / "again", verify=folder / "verify.h5")
     assert verified(folder, "again") == verified(folder, "out")
+
+
+def test_an_error_of_the_base_station_that_has_ended_is_not_taken_off(tmp_path: Path) -> None:
+    # its clock was late during the survey, and right when the second one was recorded
+    active = SCENARIO["field"] | {"variation": {"irregular": {"rms_nT": 20.0, "time_s": 40.0}}}
+    survey = SCENARIO | {"rate_Hz": 4.0, "motion": SCENARIO["motion"] | {"duration_s": 400.0}, "field": active}
+    late = {"type": "reference_clock", "offset_s": 9.0}
+    for name, one in (
+        ("late.h5", {"seed": 3, "effects": [late]}),
+        ("right.h5", {"seed": 4}),
+        ("too.h5", {"seed": 5, "effects": [late]}),
+    ):
+        write(simulate(survey | one), tmp_path / name)
+    options = {"search": ["reference_clock", "reference_scale"]}
+    ended = close_loop(tmp_path / "late.h5", verify=tmp_path / "right.h5", **options).verdict
+    goes_on = close_loop(tmp_path / "late.h5", verify=tmp_path / "too.h5", **options).verdict
+    for told in (ended, goes_on):
+        assert [a["error_model"] for a in told["adopted"]] == ["reference_clock"]
+        after = told["error"]["verify"]["after"]["total_field_rms_nT"]["all"]
+        assert (
+            after == pytest.approx(0.2, abs=0.06)
+            and after < 0.5 * told["error"]["verify"]["before"]["total_field_rms_nT"]["all"]
+        )
+    assert ended["error"]["verify"]["total_field_as_read"] == "reference_clock"
+    assert "judged as it was read" in sentence(ended)
+    assert "total_field_as_read" not in goes_on["error"]["verify"]

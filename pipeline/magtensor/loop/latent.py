@@ -53,6 +53,7 @@ class Sought:
         switches: whether it has two levels.
         of_the_log: whether noise in the logs of adopted channels explains it.
         objection: why it is not adopted; "" where nothing stands against it.
+        left_by: the adopted effect that may leave it, or have taken a part of it; "" where there is none.
     """
 
     time: Array
@@ -67,6 +68,7 @@ class Sought:
     switches: bool
     of_the_log: bool
     objection: str
+    left_by: str = ""
 
     @property
     def significant(self) -> bool:
@@ -102,7 +104,7 @@ def sought(state: State, record: Record) -> Sought | None:
     inside = lowest(z, test.band)
     gain = _predicted(inside, z - inside, basis, groups)
     like = followed(time, values, record)
-    objection = ""
+    objection = left_by = ""
     if not told:
         objection = "with two sensors it cannot be told from a disturbance of one of them"
     elif n * float(seen @ seen) <= SECOND_ORDER * explained_before(state):
@@ -128,6 +130,7 @@ def sought(state: State, record: Record) -> Sought | None:
         switches=course.switches,
         of_the_log=gain.total <= LOG_MARGIN * _of_the_logs(state),
         objection=objection,
+        left_by=left_by,
     )
 
 

@@ -4,7 +4,8 @@ Any law of the attitude resembles any other one a little. Where something large 
 (a gradient of the site, and no attitude logged to know it by), a named law that is a small part of it is significant,
 predicts held-out blocks, and is wrong elsewhere: of the five components of a gradient one looks exactly like a
 quadratic nonlinearity. So an adopted effect that follows the attitude and explains less than what stays unexplained is
-taken out again.
+taken out again; and so is what happened once, where the sensors share a larger waveform that has no name: a step or a
+passage may be a part of it.
 """
 
 from __future__ import annotations
@@ -20,8 +21,10 @@ from magtensor.loop.direction import attitude_series
 from magtensor.loop.found import Search
 from magtensor.loop.model import State
 from magtensor.loop.residual import taken_off
+from magtensor.loop.settings import EventTimes, profiled
 from magtensor.loop.terms import joined
 from magtensor.loop.unexplained import unexplained
+from magtensor.loop.waveform import NAME
 
 MOSTLY = 0.5  # of what an effect adds: so much of it, predicted from the attitude, follows the attitude
 
@@ -37,9 +40,27 @@ def overshadowed(found: Search, fixed: int) -> tuple[str, str] | None:
         if amount < left and (weakest is None or amount < weakest[0]) and attitude_share(state, places) > MOSTLY:
             weakest = amount, name
     if weakest is None or not unexplained(found, found.record)["present"]:
-        return None
+        return _part_of_a_source(found, fixed)
     amount, name = weakest
     return name, f"it follows the attitude and explains {amount:.3g} nT rms, less than the {left:.3g} nT that stay"
+
+
+def _part_of_a_source(found: Search, fixed: int) -> tuple[str, str] | None:
+    """An effect that happened once beside a larger waveform of no name, and why it is doubted."""
+    shared, state = found.shared, found.last
+    if shared is None or not shared.significant or not shared.objection or NAME in {a.name for a in state.adopted}:
+        return None
+    amount = float(np.sqrt(np.mean(shared.direction**2)))
+    for place, model in enumerate(state.adopted):
+        once = any(isinstance(grid, EventTimes) for grid in profiled(model.component).values())
+        if place < fixed or not once:
+            continue
+        before, after = removal(state, place)
+        own = float(np.sqrt(max(before**2 - after**2, 0.0)))
+        if own < amount:
+            shared_by = f"the waveform that the sensors share ({amount:.3g} nT)"
+            return model.name, f"it explains {own:.3g} nT rms and may be a part of {shared_by}"
+    return None
 
 
 def staying(found: Search) -> float:

@@ -124,7 +124,8 @@ def _station(survey: Survey) -> Station | None:
     if "despike" in made:
         good = ~spikes(values, float(made["despike"]))
         at, values = at[good], values[good]
-    return Station(at - float(made.get("latency_s", 0.0)), quieted(values, CLEARANCE))
+    at = at - float(made.get("latency_s", 0.0))
+    return Station(at, quieted(values, CLEARANCE), smooth=made.get("interpolation") == "pchip")
 
 
 def _quiet(station: Station | None, time: Array, total_field: Array | None) -> Array | None:

@@ -20,7 +20,7 @@ from magtensor.loop.exchange import looked_at_again, simpler
 from magtensor.loop.excitation import Excitation
 from magtensor.loop.found import Search, Step
 from magtensor.loop.gates import ALPHA, SECOND_ORDER, Candidate
-from magtensor.loop.latent import NAME, Sought, renewed, sought, tried_source
+from magtensor.loop.latent import NAME, Sought, Source, renewed, sought, tried_source
 from magtensor.loop.model import Adopted, Fitting, Record, State, joint_state
 from magtensor.loop.needs import missing
 from magtensor.loop.overshadowed import overshadowed
@@ -29,7 +29,7 @@ from magtensor.loop.screening import candidates_of, generic
 from magtensor.loop.separation import SEPARATION, fold_gain, separated
 from magtensor.loop.settings import EventTimes, profiled
 from magtensor.loop.spectrum import spectral_lines
-from magtensor.loop.trial import Trial, on_the_folds_of, trial
+from magtensor.loop.trial import Trial, on_the_folds_of, per_sample, trial
 
 MOST_EFFECTS = 8
 ROUNDING = 1e-4  # mean square of the whitened residual: far below the least noise that any sensor is believed to have
@@ -95,6 +95,10 @@ def search(
         if shared is None or hidden is None or NAME in {a.name for a in state.adopted}:
             break
         shared, source = tried_source(hidden, record, state, shared, how, alpha)
+        instead = None
+        if source is None and shared.left_by:
+            instead = shared.left_by
+            source = _source_instead(hidden, record, state, instead, how, len(declared), alpha)
         if source is None:
             break
         if say is not None:
@@ -103,7 +107,8 @@ def search(
         last, dropped = eliminate(record, state, how, len(declared))
         if dropped and NAME not in dropped:  # what had taken a part of the source for its own
             record, state = renewed(record, last, how)
-        steps[-1] = replace(steps[-1], adopted=source.evidence, dropped=() if NAME in dropped else dropped)
+        gone = (*([instead] if instead else []), *(() if NAME in dropped else dropped))
+        steps[-1] = replace(steps[-1], adopted=source.evidence, dropped=gone)
         standing = trial(record, state, how)
     found = Search(first, _settled(record, state, how), tuple(steps), not_tested, failed, record, shared)
     found = replace(found, shared=shared or sought(found.last, record))
@@ -139,6 +144,22 @@ def _exchanged(
         return None
     why = f"{chosen.model.name}, which has fewer coefficients, does as well beside the others"
     return after, Step(without, (chosen,), chosen, (old,), refused={old: why})
+
+
+def _source_instead(
+    component: Component, record: Record, state: State, name: str, how: Fitting, fixed: int, alpha: float
+) -> Source | None:
+    """A source nobody logged in the place of an adopted effect that has the same vectors at the sensors: of something
+    that switches now and then a single step is a part. None where it does not do better."""
+    places = [i for i, a in enumerate(state.adopted) if a.name == name and i >= fixed]
+    if not places:
+        return None
+    less = without_models(record, state, places, how)
+    shared = sought(less, record)
+    source = None if shared is None else tried_source(component, record, less, shared, how, alpha)[1]
+    if source is None or source.after.fit.keep.sum() < state.fit.keep.sum():
+        return None
+    return source if per_sample(source.after) > per_sample(state) else None
 
 
 def _settled(record: Record, state: State, how: Fitting) -> State:

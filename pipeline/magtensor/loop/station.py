@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from magtensor.calibration.types import Array
+
+if TYPE_CHECKING:
+    from scipy.interpolate import PchipInterpolator
 
 
 @dataclass(frozen=True)
@@ -16,14 +21,25 @@ class Station:
     Attributes:
         time: (M,) s on the survey's clock, increasing.
         field: (M,) nT, without the station's own noise as far as known.
+        smooth: read between its readings by a monotone cubic (PCHIP), as the total field was; else by straight lines.
     """
 
     time: Array
     field: Array
+    smooth: bool = False
 
     def at(self, time: Array) -> Array:
         """The field (N,) nT at times (N,) s; held beyond the ends."""
-        return np.interp(time, self.time, self.field)
+        if self._cubic is None:
+            return np.interp(time, self.time, self.field)
+        out: Array = self._cubic(np.clip(time, self.time[0], self.time[-1]))
+        return out
+
+    @cached_property
+    def _cubic(self) -> PchipInterpolator | None:
+        from scipy.interpolate import PchipInterpolator
+
+        return PchipInterpolator(self.time, self.field) if self.smooth and len(self.time) > 2 else None
 
     def reach(self, time: Array) -> float:
         """The share of the times (N,) s between the first and the last reading."""

@@ -47,7 +47,7 @@ class Trial:
 
     def likelier(self, after: Trial) -> bool:
         """Whether what another fit leaves is the likelier one, each in noise of its own colour."""
-        return _per_sample(after.state) > _per_sample(self.state)
+        return per_sample(after.state) > per_sample(self.state)
 
 
 def trial(record: Record, state: State, how: Fitting) -> Trial:
@@ -73,5 +73,6 @@ def _judged(record: Record, state: State, how: Fitting, keep: NDArray[np.bool_],
     return Trial(state, {s: float(figures[s]) for s in record.sensors}, folds)
 
 
-def _per_sample(state: State) -> float:
+def per_sample(state: State) -> float:
+    """Log likelihood of what a fit leaves, in noise of its own colour, for each sample that it believes."""
     return log_likelihood(state.residual, state.colours) / len(state.residual.affine)

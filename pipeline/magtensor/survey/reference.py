@@ -13,7 +13,7 @@ Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
 SPIKE_WINDOW = 7  # samples; three good neighbours on each side outvote a spike of up to three samples
-SPIKE_SURROUNDINGS = 31  # samples that tell what is usual where the field is active
+SPIKE_SURROUNDINGS = 61  # samples that tell what is usual where the field is active
 
 
 @dataclass(frozen=True)
@@ -66,28 +66,40 @@ def sample(at: Floats, time: Floats, values: Floats, *, smooth: bool, max_gap_s:
 
 
 def spikes(values: Floats, threshold: float) -> Bools:
-    """(N,) True where a sample leaves the running median by more than `threshold` robust standard deviations.
+    """(N,) True where a sample leaves both the running median and the cubic through its neighbours by more than
+    `threshold` robust standard deviations.
 
-    The deviation's scale is 1.4826 times its median magnitude over the whole record, or what the upper quartile of the
-    magnitudes around the sample would be the scale of, if that is larger: a few minutes of pulsations are no spikes. It
-    is at least the record's resolution: a proton magnetometer that rounds to 0.1 nT repeats itself for long.
+    The median tells a spike from a step, the cubic from a pulsation. Each deviation's scale is 1.4826 times its median
+    magnitude over the whole record, or what the upper quartile of the magnitudes around the sample would be the scale
+    of, if that is larger; and at least the record's resolution: a proton magnetometer that rounds to 0.1 nT repeats
+    itself for long.
 
     Args:
         values: (N,) finite.
         threshold: standard deviations.
     """
-    from scipy.ndimage import median_filter, percentile_filter
+    from scipy.ndimage import correlate1d, median_filter
 
+    least = resolution(values)
     off = np.abs(values - median_filter(values, SPIKE_WINDOW, mode="nearest"))
-    around = percentile_filter(off, 75, SPIKE_SURROUNDINGS, mode="nearest") / 1.1503  # of a Gaussian
-    limit = threshold * np.maximum(np.maximum(around, 1.4826 * np.median(off)), resolution(values))
-    bad = off > limit
+    limit = threshold * _scale(off, least)
+    rough = np.abs(correlate1d(values, np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / 6.0, mode="nearest"))
+    bad = (off > limit) & (rough > threshold * _scale(rough, least))
     if not bad.any() or bad.all():
         return bad
     # Beside a spike the running median steps aside on a steep record; what lies on the line between good
     # neighbours is good.
     place = np.arange(len(values))
     return bad & (np.abs(values - np.interp(place, place[~bad], values[~bad])) > limit)
+
+
+def _scale(deviation: Floats, least: float) -> Floats:
+    """(N,) standard deviation that magnitudes (N,) show, over all of them or around each, the larger one."""
+    from scipy.ndimage import percentile_filter
+
+    around = percentile_filter(deviation, 75, SPIKE_SURROUNDINGS, mode="nearest") / 1.1503  # of a Gaussian
+    found: Floats = np.maximum(np.maximum(around, 1.4826 * np.median(deviation)), least)
+    return found
 
 
 def noise(values: Floats) -> float:
