@@ -14,7 +14,7 @@ from magtensor.loop.settings import Delays
 from magtensor.loop.terms import Terms, joined
 from magtensor_effects.ageing import EventTime, Order, Span, courses
 
-MOST_EXCESS = 90.0  # % of the recorded variation: ten times that of the site
+MOST_EXCESS = 60.0  # % of the recorded variation: two and a half times that of the site
 NEARBY_S = 2.0  # shorter delays show as the slope over this time
 LONGEST_S = 7200.0  # two time zones
 BETWEEN_NOISE_AND_DELAY = 0.75  # of the lag: half of it is what noise makes, all of it a delay

@@ -16,6 +16,8 @@ from magtensor.loop.statistics import family_p, held_out_gain
 from magtensor.loop.terms import Terms
 from magtensor.loop.trial import WORST_RISE
 
+MOST_STEP = 5.0  # standard deviations that the last step of a fit asks for
+ROUNDED = 1e-9  # of a coefficient, whatever its units
 KEEP_ALPHA = 0.01  # an adopted effect that is no longer significant at this level is dropped
 
 
@@ -56,10 +58,15 @@ def put_back(residual: Residual, terms: Terms, theta: Array) -> Residual:
 
 
 def eliminate(record: Record, state: State, how: Fitting, fixed: int) -> tuple[State, tuple[str, ...]]:
-    """Drop models that no longer earn their place, the weakest first: those that are not significant beside the others,
-    and those without which the others predict held-out blocks as well, or much better if all noise counts alike."""
+    """Drop models that no longer earn their place, the weakest first: those whose coefficients are not what their
+    settings assume, those that are not significant beside the others, and those without which the others predict
+    held-out blocks as well, or much better if all noise counts alike."""
     dropped: list[str] = []
-    while len(state.adopted) > max(fixed, 1):
+    if len(state.adopted) == 1 > fixed:  # it has just passed; but its coefficients may have gone as all was fitted
+        assert state.terms is not None
+        if significance(state, list(range(state.terms.count))) < KEEP_ALPHA and _agrees(state, 0):
+            return state, ()
+    while len(state.adopted) > fixed:
         assert state.terms is not None
         blocks, freedom = _blocks(state), state.residual.freedom
         parts = slices(state)[fixed:]
@@ -67,7 +74,10 @@ def eliminate(record: Record, state: State, how: Fitting, fixed: int) -> tuple[S
         order = np.arange(state.terms.count)
         gains = [held_out_gain(blocks, freedom, (order < p.start) | (order >= p.stop)).total for p in parts]
         rises = [after / before for before, after in (removal(state, fixed + i) for i in range(len(parts)))]
-        if max(values) >= KEEP_ALPHA:
+        unlike = [i for i in range(fixed, len(state.adopted)) if not _agrees(state, i)]
+        if unlike:
+            weakest = unlike[0]
+        elif max(values) >= KEEP_ALPHA:
             weakest = fixed + int(np.argmax(values))
         elif min(gains) <= 0:
             weakest = fixed + int(np.argmin(gains))
@@ -78,6 +88,24 @@ def eliminate(record: Record, state: State, how: Fitting, fixed: int) -> tuple[S
         dropped.append(state.adopted[weakest].name)
         state = without_models(record, state, [weakest], how)
     return state, tuple(dropped)
+
+
+def rests(state: State, place: int) -> bool:
+    """Whether the coefficients of an adopted model explain most, in noise of the colour of what they leave.
+
+    Where noise of that colour would have others, and noise of the colour that those leave would have these, neither
+    explains the residual.
+    """
+    assert state.estimate is not None
+    own = slices(state)[place]
+    step, covariance = state.estimate.theta[own], state.estimate.covariance[own, own]
+    return bool(np.all(np.abs(step) < MOST_STEP * np.sqrt(np.maximum(np.diag(covariance), 0.0)) + ROUNDED))
+
+
+def _agrees(state: State, place: int) -> bool:
+    """Whether the coefficients of an adopted model are what its settings assume."""
+    model = state.adopted[place]
+    return model.component.agrees is None or model.component.agrees(model.settings, state.theta[place])
 
 
 def without_models(record: Record, state: State, places: Sequence[int], how: Fitting) -> State:

@@ -35,6 +35,9 @@ ALPHA = 0.001  # family-wise over the bands
 LEAST_SENSORS = 3  # from here on noise of single sensors does not imitate a factor
 LEAST_BAND = 6  # coefficients of the lowest band for each value across
 _PARTS = 6  # of a band, in which the noise of different values may have different power
+QUIET = 5.0  # times the median square of a step: of a few dozen values none is as large by chance
+LEVEL_ROUNDS = 3
+LEAST_NOISE = 0.1  # of what the fit believes
 SECOND = 0.1  # a second factor this strong beside the first: not one waveform
 
 
@@ -165,11 +168,28 @@ def tried_source(
     record, after = renewed(record, after, how)
     if _turning(record, after):
         return replace(found, objection="its waveform follows the direction of the field"), None
-    model = Adopted(component, {"noise_nT": [float(v) for v in after.residual.noise]})
+    model = Adopted(component, {"noise_nT": [float(v) for v in _own_noise(after)]})
     after = replace(after, adopted=(*after.adopted[:-1], model))
     gain = found.gain
     evidence = Assessment(estimate, gain, gain, None, None, found.p, found.p, state.colours, estimate.theta)
     return found, Source(record, after, Candidate(model, 1, terms, evidence, found.p, found.p, ALPHA))
+
+
+def _own_noise(state: State) -> Array:
+    """(3 S,) nT, white noise of the outputs beside an adopted source.
+
+    From differences of neighbouring samples in which the source is left: its waveform, one value a sample, has taken
+    with it the most of the noise of those outputs that feel it most.
+    """
+    found = _put_back(state)
+    assert found is not None
+    basis = free_directions(np.eye(len(state.residual.noise)) - state.residual.projector)
+    steps = np.diff(found[0] @ basis, axis=0) / np.sqrt(2.0)
+    size = np.sum(steps**2, axis=1)
+    quiet = steps[size < QUIET * np.median(size)]  # where it does not switch
+    alone = noise_alone(quiet.T @ quiet / len(quiet), basis, _outputs(basis))
+    out: Array = state.residual.noise * np.sqrt(np.maximum(np.diag(alone.noise), LEAST_NOISE**2))
+    return out
 
 
 def _told_from_the_field(residual: Residual, held: Array, direction: Array) -> Course:
@@ -192,12 +212,34 @@ def renewed(record: Record, state: State, how: Fitting) -> tuple[Record, State]:
     if found is None:
         return record, state
     across, direction = found
-    course = course_of(across, np.eye(len(direction)) - state.residual.projector, direction)
+    course = _course_beside_the_field(across, np.eye(len(direction)) - state.residual.projector, direction, state)
     if course.rms == 0:
         return record, state
     waveform = np.interp(record.time, record.time[state.residual.samples], course.values / course.rms)
     record = replace(record, waveform=waveform)
     return record, joint_state(record, state.adopted, how, state.theta, state.lines)
+
+
+def _course_beside_the_field(across: Array, held: Array, direction: Array, state: State) -> Course:
+    """The waveform as in `course_of`; if it is one of two levels once what goes with the field has gone, that.
+
+    What C lacks along the source's vectors is in its waveform, where one that may be anything keeps it. The levels of
+    one that switches tell it: then C takes it back.
+    """
+    course = course_of(across, held, direction)
+    if course.switches or course.rms == 0:
+        return course
+    free = free_directions(held)
+    seen = free.T @ direction
+    series, affine = across @ free @ seen / float(seen @ seen), state.residual.affine
+    on = course.values > 0.5 * (course.values.min() + course.values.max())
+    part = np.zeros(len(series))
+    for _ in range(LEVEL_ROUNDS):
+        *field, step = np.linalg.lstsq(np.column_stack([affine, on]), series, rcond=1e-12)[0]
+        part = affine @ np.array(field)
+        on = (series - part) / step > 0.5 if step else on
+    levels = course_of(across - np.outer(part - part.mean(), direction), held, direction)
+    return levels if levels.switches else course
 
 
 def _share(residual: Residual, z: Array, values: Array, direction: Array) -> float:

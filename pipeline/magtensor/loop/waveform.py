@@ -19,7 +19,8 @@ from magtensor.calibration.types import Array
 from magtensor.loop.switching import two_levels
 
 NAME = "latent_source"
-LEAST_SHARE = 0.02  # of the vector's square that must lie in free directions: less brings in noise, as much again
+LEAST_SHARE = 0.02  # of the vector's square that must lie in free directions: less brings in noise, as much again,
+# unless two levels tell each sample's state
 LEAST_IN_BAND = 12  # cosine coefficients from which a level of the spectrum is taken
 BANDS = 40
 
@@ -57,7 +58,7 @@ def course_of(whitened: Array, held: Array, direction: Array, good: NDArray[np.b
     basis = free_directions(held)
     d = basis.T @ direction
     information = float(d @ d)
-    if information < LEAST_SHARE * float(direction @ direction) or information == 0:
+    if information == 0:
         return Course(np.zeros(n), 0.0, 0.0, 0.0)
     used = np.arange(n) if good is None else np.flatnonzero(good)
     if not len(used):
@@ -65,6 +66,8 @@ def course_of(whitened: Array, held: Array, direction: Array, good: NDArray[np.b
     z = whitened[used] @ basis
     rest = z @ np.linalg.svd(d[None, :])[2][1:].T
     course = _filtered(z @ d / information, rest, information)
+    if information < LEAST_SHARE * float(direction @ direction) and not course.switches:
+        return Course(np.zeros(n), 0.0, 0.0, 0.0)
     return replace(course, values=np.interp(np.arange(n), used, course.values))
 
 
