@@ -152,6 +152,13 @@ def test_some_minutes_of_pulsations_are_no_spikes() -> None:
     assert np.flatnonzero(spikes(record, 8.0)).tolist() == [100, 500]
 
 
+@pytest.mark.parametrize("slope", [0.0, -0.1, 0.3])
+def test_the_readings_beside_a_step_are_no_spikes(slope: float) -> None:
+    at = np.arange(400)
+    record = 48_000 + slope * at + 1.5 * (at >= 165) + 0.02 * np.random.default_rng(4).normal(size=400)
+    assert not spikes(np.round(record, 2), 8.0).any()
+
+
 def test_the_reference_s_noise_is_carried() -> None:
     rng = np.random.default_rng(2)
     time = np.arange(-5.0, 50.0, 0.05)

@@ -13,6 +13,7 @@ Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
 SPIKE_WINDOW = 7  # samples; three good neighbours on each side outvote a spike of up to three samples
+SPIKE_ALONE = 0.7  # of its deviation from the cubic: both are the spike's height, and half a step's from the cubic
 SPIKE_SURROUNDINGS = 61  # samples that tell what is usual where the field is active
 
 
@@ -69,10 +70,10 @@ def spikes(values: Floats, threshold: float) -> Bools:
     """(N,) True where a sample leaves both the running median and the cubic through its neighbours by more than
     `threshold` robust standard deviations.
 
-    The median tells a spike from a step, the cubic from a pulsation. Each deviation's scale is 1.4826 times its median
-    magnitude over the whole record, or what the upper quartile of the magnitudes around the sample would be the scale
-    of, if that is larger; and at least the record's resolution: a proton magnetometer that rounds to 0.1 nT repeats
-    itself for long.
+    The median tells a spike from a step, beside which only the cubic strays; the cubic tells it from a pulsation. Each
+    deviation's scale is 1.4826 times its median magnitude over the whole record, or what the upper quartile of the
+    magnitudes around the sample would be the scale of, if that is larger; and at least the record's resolution: a
+    proton magnetometer that rounds to 0.1 nT repeats itself for long.
 
     Args:
         values: (N,) finite.
@@ -84,7 +85,7 @@ def spikes(values: Floats, threshold: float) -> Bools:
     off = np.abs(values - median_filter(values, SPIKE_WINDOW, mode="nearest"))
     limit = threshold * _scale(off, least)
     rough = np.abs(correlate1d(values, np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / 6.0, mode="nearest"))
-    bad = (off > limit) & (rough > threshold * _scale(rough, least))
+    bad = (off > limit) & (rough > threshold * _scale(rough, least)) & (off > SPIKE_ALONE * rough)
     if not bad.any() or bad.all():
         return bad
     # Beside a spike the running median steps aside on a steep record; what lies on the line between good
