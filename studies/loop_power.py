@@ -73,7 +73,7 @@ RIGHT: dict[str, dict[str, Any]] = {
     "sampling_lag": {"per_axis": True},
     "viscous_magnetisation": {"tau_s": 20.0},
     "moving_part": {"channel": "encoder"},
-    "periodic_interference": {"frequency_Hz": 49.7},
+    "periodic_interference": {"frequency_Hz": 49.7123},
     "channel_response": {"channel": "pressure", "power": 2, "lag_s": 3.0},
     "reference_step": {"time_s": 700.0},
     "reference_drift": {"order": 3},

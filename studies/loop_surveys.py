@@ -74,7 +74,7 @@ EFFECTS: dict[str, dict[str, Any]] = {
     "clock_drift": {},
     "viscous_magnetisation": {},
     "moving_part": {"position_m": [0.3, 0.2, -0.8]},
-    "periodic_interference": {"frequency_Hz": 49.7},
+    "periodic_interference": {"frequency_Hz": 49.7123},
     "frame_flexure": {},
     "channel_response": {"channel": "pressure", "power": 2, "lag_s": 3.0},
     "latent_source": {"waveform_of": {"type": "switched", "mean_hold_s": 70.0}},
@@ -95,7 +95,7 @@ FAMILIES = (
     ("fixed_source", "site_gradient"),
     ("reference_clock", "reference_drift", "reference_step"),
 )  # those of one family may imitate each other
-STAGES = "title: study\nstages: [load, {detrend_diurnal: {uncovered: mask}}]\n"
+STAGES = "title: study\nstages: [load, {detrend_diurnal: {uncovered: mask, despike: 8}}]\n"
 
 WHITE_NT: float = BASE["instrument"]["noise"]["white_sd_nT"]
 
