@@ -209,6 +209,14 @@ def test_apply_to_another_instrument(
     assert not target.exists()
 
 
+def test_apply_to_a_survey_that_is_not_there(command: Any, finished: Path, tmp_path: Path) -> None:
+    target = tmp_path / "out.nc"
+    command("apply", finished / "calibration.nc", tmp_path / "none.h5", "--output", target).refused(
+        r"none\.h5: no such file"
+    )
+    assert not target.exists()
+
+
 def test_apply_without_a_reference_and_with_gaps(
     command: Any, finished: Path, contents: Contents, tmp_path: Path
 ) -> None:
