@@ -48,15 +48,19 @@ def overshadowed(found: Search, fixed: int) -> tuple[str, str] | None:
 def _part_of_a_source(found: Search, fixed: int) -> tuple[str, str] | None:
     """An effect that happened once beside a larger waveform of no name, and why it is doubted."""
     shared, state = found.shared, found.last
-    if shared is None or not shared.significant or not shared.objection or NAME in {a.name for a in state.adopted}:
+    if shared is None or NAME in {a.name for a in state.adopted}:
+        return None
+    if not shared.significant or not shared.gain.consistent:
         return None
     amount = float(np.sqrt(np.mean(shared.direction**2)))
     for place, model in enumerate(state.adopted):
         once = any(isinstance(grid, EventTimes) for grid in profiled(model.component).values())
         if place < fixed or not once:
             continue
-        before, after = removal(state, place)
-        own = float(np.sqrt(max(before**2 - after**2, 0.0)))
+        assert state.terms is not None
+        theta = np.zeros(state.terms.count)
+        theta[slices(state)[place]] = state.theta[place]
+        own = float(np.sqrt(np.mean(state.terms.contribution(theta, shared.direction.size) ** 2)))
         if own < amount:
             shared_by = f"the waveform that the sensors share ({amount:.3g} nT)"
             return model.name, f"it explains {own:.3g} nT rms and may be a part of {shared_by}"
