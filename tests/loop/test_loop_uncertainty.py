@@ -6,11 +6,14 @@ from pathlib import Path
 
 import h5py
 import numpy as np
+import pytest
 from loop_cases import scenario, survey_file
 
 import magtensor
 from magtensor.applying import apply_to
 from magtensor.effect_errors import COVARIANCE
+from magtensor.loop.model import without_noise
+from magtensor.loop.statistics import Estimate
 from magtensor.result import open_result
 from magtensor.survey.model import without_variables
 
@@ -50,3 +53,14 @@ def test_errors_of_the_coefficients_go_with_the_calibration(tmp_path: Path) -> N
     )
     assert np.isfinite(with_errors).all()
     assert (with_errors > 1.2 * without).any() and (with_errors >= 0.999 * without).all()
+
+
+@pytest.mark.parametrize(("common", "stays"), [(4.8, False), (100.0, True)])
+def test_what_the_data_hardly_show_stays_zero_until_it_is_significant(common: float, stays: bool) -> None:
+    # drifts of four clocks: what they have in common is a turn of the field, seen in the second order only
+    ones = np.full((4, 4), 0.25)
+    normal = 2500.0 * (np.eye(4) - ones) + 0.018 * ones  # standard deviation of the mean: 3.7
+    apart = np.array([2.4, 2.4, 2.4, -7.2])
+    estimate = Estimate(apart + common, np.linalg.inv(normal), normal, 4)
+    found = without_noise(apart + common, estimate)
+    np.testing.assert_allclose(found, apart + common if stays else apart, atol=1e-9)

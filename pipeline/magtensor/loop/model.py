@@ -29,6 +29,8 @@ from magtensor.loop.terms import Terms, joined
 MOST_ROUNDS = 6
 _SLACK = 4.0  # in the error accepted while an effect may yet turn out to cause most of it
 SETTLED = 0.02  # of a standard deviation
+HARDLY_SHOWN = 1e3  # times the variance that a coefficient would have alone
+SHOWN = 3.0  # standard deviations
 _SHARES = (1.0, 0.5, 0.1)  # of a step, tried in this order
 _LIKELIHOOD_ROUNDING = 0.5  # a spectrum fitted anew is not the same to the last digit
 
@@ -244,10 +246,35 @@ def joint_state(
             fit = _fit(record, raw, reference, how, keep)
             x = excitation_of(record, fit, lines)
             break
+    if estimate is not None:
+        shown = without_noise(np.concatenate(theta), estimate)
+        if not np.array_equal(shown, np.concatenate(theta)):
+            theta = np.split(shown, edges)
+            raw, reference = without(record, each, theta)
+            fit = _fit(record, raw, reference, how, keep)
+            x = excitation_of(record, fit, lines)
     residual = residual_of(fit, raw, reference, how.reference_noise)
     if adopted:
         terms = joined([a.terms(x) for a in adopted]).at(residual.samples)
     return State(tuple(adopted), tuple(theta), fit, residual, x, terms, estimate, tuple(lines))
+
+
+def without_noise(theta: Array, estimate: Estimate) -> Array:
+    """Coefficients (P,) without what noise alone has made of directions that the data hardly show.
+
+    A delay of all sensors alike is a turn of the field, and shows in the second order only, if the total field is
+    known: what is found of it is noise, many times what the differences between the sensors are known to, and would be
+    applied to every survey. Such a direction stays zero until it is significant.
+    """
+    known = np.sqrt(np.maximum(np.diag(estimate.normal), 0.0))
+    if not (known > 0).all():
+        return theta
+    inflated, directions = np.linalg.eigh(estimate.covariance * np.outer(known, known))
+    for variance, direction in zip(inflated, directions.T / known, strict=True):
+        along = float(theta @ direction) / float(direction @ direction)
+        if variance > HARDLY_SHOWN and along**2 < SHOWN**2 * variance:
+            theta = theta - along * direction
+    return theta
 
 
 def share_of(residual: Residual, terms: Terms, step: Array, colours: Colours) -> float:
