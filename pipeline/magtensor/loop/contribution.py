@@ -91,7 +91,8 @@ def eliminate(record: Record, state: State, how: Fitting, fixed: int) -> tuple[S
 
 
 def rests(state: State, place: int) -> bool:
-    """Whether the coefficients of an adopted model explain most, in noise of the colour of what they leave.
+    """Whether the coefficients of an adopted model explain most, in noise of the colour of what they leave: a last step
+    that is larger than they are was not taken.
 
     Where noise of that colour would have others, and noise of the colour that those leave would have these, neither
     explains the residual.
@@ -99,7 +100,9 @@ def rests(state: State, place: int) -> bool:
     assert state.estimate is not None
     own = slices(state)[place]
     step, covariance = state.estimate.theta[own], state.estimate.covariance[own, own]
-    return bool(np.all(np.abs(step) < MOST_STEP * np.sqrt(np.maximum(np.diag(covariance), 0.0)) + ROUNDED))
+    std = np.sqrt(np.maximum(np.diag(covariance), 0.0)) + ROUNDED
+    asked, held = np.abs(step) / std, np.abs(state.theta[place]) / std
+    return bool(asked.max() < MOST_STEP or np.linalg.norm(asked) < np.linalg.norm(held))
 
 
 def _agrees(state: State, place: int) -> bool:
