@@ -152,6 +152,14 @@ def test_some_minutes_of_pulsations_are_no_spikes() -> None:
     assert np.flatnonzero(spikes(record, 8.0)).tolist() == [100, 500]
 
 
+def test_a_spike_of_a_stormy_record_is_found() -> None:
+    at = np.arange(400)
+    storm = 25.0 * np.sin(at / 9.0) + 40.0 * np.sin(at / 40.0)
+    record = 48_000 + storm + 0.05 * np.random.default_rng(6).normal(size=400)
+    record[[60, 61, 230]] += [4.0, 0.0, -6.0]
+    assert np.flatnonzero(spikes(record, 8.0)).tolist() == [60, 230]
+
+
 @pytest.mark.parametrize("slope", [0.0, -0.1, 0.3])
 def test_the_readings_beside_a_step_are_no_spikes(slope: float) -> None:
     at = np.arange(400)

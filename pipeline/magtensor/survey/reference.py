@@ -14,6 +14,7 @@ Bools = NDArray[np.bool_]
 
 SPIKE_WINDOW = 7  # samples; three good neighbours on each side outvote a spike of up to three samples
 SPIKE_ALONE = 0.7  # of its deviation from the cubic: both are the spike's height, and half a step's from the cubic
+LEFT_BESIDE = 0.25  # of its deviation from the cubic
 SPIKE_SURROUNDINGS = 61  # samples that tell what is usual where the field is active
 
 
@@ -84,14 +85,29 @@ def spikes(values: Floats, threshold: float) -> Bools:
     least = resolution(values)
     off = np.abs(values - median_filter(values, SPIKE_WINDOW, mode="nearest"))
     limit = threshold * _scale(off, least)
-    rough = np.abs(correlate1d(values, np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / 6.0, mode="nearest"))
-    bad = (off > limit) & (rough > threshold * _scale(rough, least)) & (off > SPIKE_ALONE * rough)
+    strays = correlate1d(values, np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / 6.0, mode="nearest")
+    rough = np.abs(strays)
+    astray = rough > threshold * _scale(rough, least)
+    alone = astray & (_left_beside(strays) < LEFT_BESIDE * rough)
+    bad = (off > limit) & astray & (off > SPIKE_ALONE * rough)
     if not bad.any() or bad.all():
-        return bad
+        return alone
     # Beside a spike the running median steps aside on a steep record; what lies on the line between good
     # neighbours is good.
     place = np.arange(len(values))
-    return bad & (np.abs(values - np.interp(place, place[~bad], values[~bad])) > limit)
+    return alone | bad & (np.abs(values - np.interp(place, place[~bad], values[~bad])) > limit)
+
+
+def _left_beside(strays: Floats) -> Floats:
+    """(N,) the largest of the deviations from the cubic (N,) of the two neighbours on each side, if the sample itself
+    lay on it: those beside a spike come from it alone."""
+    n = len(strays)
+    padded = np.pad(strays, 2)
+    each = [
+        padded[2 + k : 2 + k + n] + share * strays for k, share in ((-2, -1 / 6), (-1, 2 / 3), (1, 2 / 3), (2, -1 / 6))
+    ]
+    found: Floats = np.max(np.abs(each), axis=0)
+    return found
 
 
 def _scale(deviation: Floats, least: float) -> Floats:
