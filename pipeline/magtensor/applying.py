@@ -18,7 +18,7 @@ from magtensor.recipe.plan import Plan
 from magtensor.survey.flags import summary
 from magtensor.survey.in_memory import Held
 from magtensor.survey.model import Survey, Variable
-from magtensor.verdict import survey_block
+from magtensor.verdict import WORSE, survey_block
 
 if TYPE_CHECKING:
     from magtensor.platform_frame import Tied
@@ -243,7 +243,8 @@ def verification(calibrated: Survey, path: Path | Held, planned: Plan) -> dict[s
     """The error blocks of another survey: with the declared model alone, and with all that was adopted.
 
     An error of the base station may have ended with its own survey, or another station was there: if this survey's
-    total field fits better as it was read, it is judged by that, and `total_field_as_read` names what was left in.
+    total field fits clearly better as it was read, it is judged by that, and `total_field_as_read` names what was left
+    in.
     """
     from magtensor.loop.stored import stored_effects
 
@@ -263,7 +264,7 @@ def verification(calibrated: Survey, path: Path | Held, planned: Plan) -> dict[s
         as_read = load_as(planned, path)["total_field"]
         given = (["time"], as_read.values, dict(as_read.attrs))
         block = survey_block(corrected.merged({"total_field": given}))
-        if _total_field_error(block) < _total_field_error(after):
+        if WORSE * _total_field_error(block) < _total_field_error(after):
             found |= {"after": block, "total_field_as_read": ", ".join(of_reference)}
     return found
 

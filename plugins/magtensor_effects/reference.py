@@ -8,7 +8,6 @@ from pydantic import Field
 
 from magtensor.calibration.types import Array
 from magtensor.components import error_model
-from magtensor.errors import DataError
 from magtensor.loop.excitation import Excitation
 from magtensor.loop.settings import Delays
 from magtensor.loop.terms import Terms, joined
@@ -18,12 +17,6 @@ MOST_EXCESS = 60.0  # % of the recorded variation: two and a half times that of 
 NEARBY_S = 2.0  # shorter delays show as the slope over this time
 LONGEST_S = 7200.0  # two time zones
 BETWEEN_NOISE_AND_DELAY = 0.75  # of the lag: half of it is what noise makes, all of it a delay
-
-
-def _total_field(x: Excitation) -> Array:
-    if x.total_field is None:
-        raise DataError("the survey has no reference total field")
-    return x.total_field
 
 
 def _seen_at_all(_: Mapping[str, Any], coefficients: Array) -> bool:
@@ -44,7 +37,7 @@ def reference_scale(x: Excitation) -> Terms:
     The total field about its mean; the coefficient is the part of the recorded variation that the site does not see.
     Common to all sensors, so the tensor does not feel it. Rival: `scale_drift` where the variation is steady.
     """
-    f = _total_field(x)
+    f = x.reference
     return x.on_reference(0.01 * (f - f.mean()), "%", "excess")
 
 
@@ -101,10 +94,9 @@ def reference_drift(x: Excitation, *, order: Order = 1, span_s: Span = 3600.0) -
 
     Legendre polynomials of time over span_s, less their values at the start, when the station is taken to be right: the
     coefficient of P1 is half the change from the start to the end. Common to all sensors, so the tensor does not feel
-    it. Rival: `scale_drift` with one course for all axes of all sensors,
-    which nothing but another reference would tell from it.
+    it. Rival: `scale_drift` with one course for all axes of all sensors, which nothing but another reference would tell
+    from it.
     """
-    _total_field(x)
     named = enumerate(courses(x, order, span_s), start=1)
     return joined([x.on_reference(course - (-1.0) ** k, "nT", f"P{k}") for k, course in named])
 
@@ -117,5 +109,4 @@ def reference_step(x: Excitation, *, time_s: EventTime = 0.0) -> Terms:
 
     One coefficient. Rival: a jump of all scale factors, which nothing else would tell from it.
     """
-    _total_field(x)
     return x.on_reference((x.elapsed >= time_s).astype(float), "nT", "step")

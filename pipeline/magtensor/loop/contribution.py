@@ -60,13 +60,9 @@ def put_back(residual: Residual, terms: Terms, theta: Array) -> Residual:
 def eliminate(record: Record, state: State, how: Fitting, fixed: int) -> tuple[State, tuple[str, ...]]:
     """Drop models that no longer earn their place, the weakest first: those whose coefficients are not what their
     settings assume, those that are not significant beside the others, and those without which the others predict
-    held-out blocks as well, or much better if all noise counts alike."""
+    held-out blocks as well, or much better if all noise counts alike. A single one has just passed the gates."""
     dropped: list[str] = []
-    if len(state.adopted) == 1 > fixed:  # it has just passed; but its coefficients may have gone as all was fitted
-        assert state.terms is not None
-        if significance(state, list(range(state.terms.count))) < KEEP_ALPHA and _agrees(state, 0):
-            return state, ()
-    while len(state.adopted) > fixed:
+    while len(state.adopted) > (fixed if dropped else max(fixed, 1)):
         assert state.terms is not None
         blocks, freedom = _blocks(state), state.residual.freedom
         parts = slices(state)[fixed:]
@@ -74,7 +70,7 @@ def eliminate(record: Record, state: State, how: Fitting, fixed: int) -> tuple[S
         order = np.arange(state.terms.count)
         gains = [held_out_gain(blocks, freedom, (order < p.start) | (order >= p.stop)).total for p in parts]
         rises = [after / before for before, after in (removal(state, fixed + i) for i in range(len(parts)))]
-        unlike = [i for i in range(fixed, len(state.adopted)) if not _agrees(state, i)]
+        unlike = [i for i in range(fixed, len(state.adopted)) if not agrees(state, i)]
         if unlike:
             weakest = unlike[0]
         elif max(values) >= KEEP_ALPHA:
@@ -105,7 +101,7 @@ def rests(state: State, place: int) -> bool:
     return bool(asked.max() < MOST_STEP or np.linalg.norm(asked) < np.linalg.norm(held))
 
 
-def _agrees(state: State, place: int) -> bool:
+def agrees(state: State, place: int) -> bool:
     """Whether the coefficients of an adopted model are what its settings assume."""
     model = state.adopted[place]
     return model.component.agrees is None or model.component.agrees(model.settings, state.theta[place])

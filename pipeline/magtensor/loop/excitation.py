@@ -102,6 +102,17 @@ class Excitation:
         """(N,) s since the survey's start."""
         return self.time - self.start
 
+    @property
+    def reference(self) -> Array:
+        """(N,) nT, the reference total field.
+
+        Raises:
+            DataError: there is none.
+        """
+        if self.total_field is None:
+            raise DataError("the survey has no reference total field")
+        return self.total_field
+
     @cached_property
     def readings(self) -> Station:
         """Of the reference total field: the base station's own, or those at the samples.
@@ -109,9 +120,7 @@ class Excitation:
         Raises:
             DataError: there is no reference.
         """
-        if self.total_field is None:
-            raise DataError("the survey has no reference total field")
-        return self.station or Station(self.time, self.total_field)
+        return self.station or Station(self.time, self.reference)
 
     def channels_like(self, pattern: str, without: tuple[str, ...] = ()) -> list[str]:
         """The logged channels whose names fit."""

@@ -15,7 +15,7 @@ from magtensor.components import Component
 from magtensor.errors import DataError
 from magtensor.loop.adopting import adopt, narrowed, polished
 from magtensor.loop.changing_matrix import channel_instead
-from magtensor.loop.contribution import eliminate, rests, without_models
+from magtensor.loop.contribution import agrees, eliminate, rests, without_models
 from magtensor.loop.exchange import looked_at_again, simpler
 from magtensor.loop.excitation import Excitation
 from magtensor.loop.found import Search, Step
@@ -231,9 +231,8 @@ def _kept(record: Record, before: Trial, chosen: Candidate, how: Fitting) -> tup
     if hurt:
         return None, f"fitted, it raises the held-out error of {', '.join(hurt)}"
     which = len(before.state.adopted)
-    model, theta = after.state.adopted[-1], after.state.theta[-1]
-    agrees = model.component.agrees
-    if agrees is not None and not agrees(model.settings, theta):
+    model = after.state.adopted[which]
+    if not agrees(after.state, which):
         return None, "fitted, its coefficients are not what its settings assume"
     if not rests(after.state, which):
         return None, "fitted, its coefficients do not rest: noise of another colour wants others"

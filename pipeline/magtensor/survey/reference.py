@@ -14,7 +14,7 @@ Bools = NDArray[np.bool_]
 
 SPIKE_WINDOW = 7  # samples; three good neighbours on each side outvote a spike of up to three samples
 SPIKE_ALONE = 0.7  # of its deviation from the cubic: both are the spike's height, and half a step's from the cubic
-LEFT_BESIDE = 0.25  # of its deviation from the cubic
+LEFT_BESIDE = 0.25  # of its deviation from the cubic: a lone spike leaves nothing at its neighbours, a step a third
 SPIKE_SURROUNDINGS = 61  # samples that tell what is usual where the field is active
 
 
@@ -68,13 +68,14 @@ def sample(at: Floats, time: Floats, values: Floats, *, smooth: bool, max_gap_s:
 
 
 def spikes(values: Floats, threshold: float) -> Bools:
-    """(N,) True where a sample leaves both the running median and the cubic through its neighbours by more than
-    `threshold` robust standard deviations.
+    """(N,) True where a sample leaves the cubic through its neighbours by more than `threshold` robust standard
+    deviations, and is a spike and no step: either its neighbours would lie on their cubics if it lay on its own, or it
+    leaves the running median as well, as up to three samples beside each other do.
 
-    The median tells a spike from a step, beside which only the cubic strays; the cubic tells it from a pulsation. Each
-    deviation's scale is 1.4826 times its median magnitude over the whole record, or what the upper quartile of the
-    magnitudes around the sample would be the scale of, if that is larger; and at least the record's resolution: a
-    proton magnetometer that rounds to 0.1 nT repeats itself for long.
+    The cubic tells a spike from a pulsation; the neighbours and the median tell it from a step, and the neighbours do
+    so where the record is steep. Each deviation's scale is 1.4826 times its median magnitude over the whole record, or
+    what the upper quartile of the magnitudes around the sample would be the scale of, if that is larger; and at least
+    the record's resolution: a proton magnetometer that rounds to 0.1 nT repeats itself for long.
 
     Args:
         values: (N,) finite.
@@ -83,19 +84,21 @@ def spikes(values: Floats, threshold: float) -> Bools:
     from scipy.ndimage import correlate1d, median_filter
 
     least = resolution(values)
-    off = np.abs(values - median_filter(values, SPIKE_WINDOW, mode="nearest"))
-    limit = threshold * _scale(off, least)
     strays = correlate1d(values, np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / 6.0, mode="nearest")
     rough = np.abs(strays)
     astray = rough > threshold * _scale(rough, least)
     alone = astray & (_left_beside(strays) < LEFT_BESIDE * rough)
-    bad = (off > limit) & astray & (off > SPIKE_ALONE * rough)
-    if not bad.any() or bad.all():
-        return alone
-    # Beside a spike the running median steps aside on a steep record; what lies on the line between good
-    # neighbours is good.
-    place = np.arange(len(values))
-    return alone | bad & (np.abs(values - np.interp(place, place[~bad], values[~bad])) > limit)
+    off = np.abs(values - median_filter(values, SPIKE_WINDOW, mode="nearest"))
+    limit = threshold * _scale(off, least)
+    several = astray & (off > limit) & (off > SPIKE_ALONE * rough)
+    if several.any() and not several.all():
+        # Beside a spike the running median steps aside on a steep record; what lies on the line between good
+        # neighbours is good.
+        place = np.arange(len(values))
+        several &= np.abs(values - np.interp(place, place[~several], values[~several])) > limit
+    else:
+        several[:] = False
+    return alone | several
 
 
 def _left_beside(strays: Floats) -> Floats:
