@@ -13,21 +13,26 @@ from magtensor.loop.settings import Delays
 from magtensor.loop.terms import Terms, joined
 from magtensor_effects.ageing import EventTime, Order, Span, courses
 
-MOST_EXCESS = 60.0  # % of the recorded variation: two and a half times that of the site
 NEARBY_S = 2.0  # shorter delays show as the slope over this time
 LONGEST_S = 7200.0  # two time zones
 BETWEEN_NOISE_AND_DELAY = 0.75  # of the lag: half of it is what noise makes, all of it a delay
 
 
-def _seen_at_all(_: Mapping[str, Any], coefficients: Array) -> bool:
-    """Whether the site sees some of the recorded variation: noise of the base station is recorded and not there."""
-    return bool(coefficients[0] < MOST_EXCESS)
+def _more_than_noise(_: Mapping[str, Any], coefficients: Array, explained: float) -> bool:
+    """Whether an excess of the recorded variation explains more than it would if it were noise of the base station.
+
+    Noise w beside a variation v is recorded and not seen at the site: the excess is fitted as k = w^2 / (v^2 + w^2) and
+    explains the share k of the residual, which is w, whatever the weights; a true excess explains all that is not of
+    the sensors. Half way between is sqrt(k), and twice the share is beyond the chance likeness of v and w.
+    """
+    excess = 0.01 * float(coefficients[0])
+    return excess <= 0.0 or (explained > min(np.sqrt(excess), 2.0 * excess) and excess < 1.0)
 
 
 @error_model(
     "reference",
     needs=("total_field",),
-    agrees=_seen_at_all,
+    agrees=_more_than_noise,
     source="spatial change of the diurnal variation",
     typical="0.1 to 1 nT; some per cent of the variation over tens of km or beside a coast",
 )
@@ -41,7 +46,7 @@ def reference_scale(x: Excitation) -> Terms:
     return x.on_reference(0.01 * (f - f.mean()), "%", "excess")
 
 
-def _delayed_by_its_lag(settings: Mapping[str, Any], coefficients: Array) -> bool:
+def _delayed_by_its_lag(settings: Mapping[str, Any], coefficients: Array, _: float) -> bool:
     """Whether the delay is the lag that the difference was taken over.
 
     Noise of the base station, slow or fast, seems to be explained by half of that difference, for it is in both.

@@ -8,6 +8,7 @@ import h5py
 import numpy as np
 import pytest
 from loop_cases import scenario, verdict_of
+from scipy.signal import lfilter
 
 SEARCHED = ["reference_clock", "reference_scale", "reference_drift", "scale_drift"]
 
@@ -57,3 +58,37 @@ def test_spikes_of_the_base_station_are_left_out(tmp_path: Path) -> None:
 
     told = verdict_of(tmp_path, scenario(45), spiky, ["reference_clock", "reference_scale", "passing_source"])
     assert not told["adopted"] and not told["unexplained"]["present"], told["unexplained"]["description"]
+
+
+@pytest.mark.parametrize("time_s", [10.0, 60.0])
+@pytest.mark.parametrize("seed", [1, 2])
+def test_noise_that_is_as_large_as_the_variation_is_no_excess_of_it(seed: int, time_s: float, tmp_path: Path) -> None:
+    # half of what such a station records is not there at the site, sample by sample: a regression finds 50 %
+    def noisy(path: Path) -> None:
+        rng = np.random.default_rng(seed)
+        with h5py.File(path, "a") as file:
+            field = file["reference/total_field"]
+            kept = np.exp(-np.median(np.diff(file["reference/time"])) / time_s)
+            steps = np.sqrt(1.0 - kept**2) * rng.standard_normal(len(field))
+            field[:] = field[:] + lfilter([1.0], [1.0, -kept], steps)
+
+    survey = scenario(seed)
+    survey["field"]["variation"] = {"irregular": {"rms_nT": 1.0, "time_s": time_s}}
+    told = verdict_of(tmp_path, survey, noisy, ["reference_clock", "reference_scale"])
+    assert not told["adopted"]
+    assert "reference_scale" in told["unexplained"]["looks_like"]
+
+
+@pytest.mark.parametrize("excess", [0.7, -0.5])
+def test_a_base_station_that_sees_another_variation_is_found(excess: float, tmp_path: Path) -> None:
+    # 1 / 0.3 of the site's variation is recorded, or 1 / 1.5 of it; the array knows which part is missing
+    def elsewhere(path: Path) -> None:
+        with h5py.File(path, "a") as file:
+            field = file["reference/total_field"]
+            values = field[:]
+            field[:] = values.mean() + (values - values.mean()) / (1.0 - excess)
+
+    told = verdict_of(tmp_path, scenario(46), elsewhere, ["reference_clock", "reference_scale"])
+    assert [a["error_model"] for a in told["adopted"]] == ["reference_scale"]
+    found = told["adopted"][0]["coefficients"][0]
+    assert found["value"] == pytest.approx(100 * excess, abs=max(5 * found["std"], 2.0))

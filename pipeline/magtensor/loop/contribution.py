@@ -16,8 +16,6 @@ from magtensor.loop.statistics import family_p, held_out_gain
 from magtensor.loop.terms import Terms
 from magtensor.loop.trial import WORST_RISE
 
-MOST_STEP = 5.0  # standard deviations that the last step of a fit asks for
-ROUNDED = 1e-9  # of a coefficient, whatever its units
 KEEP_ALPHA = 0.01  # an adopted effect that is no longer significant at this level is dropped
 
 
@@ -86,25 +84,26 @@ def eliminate(record: Record, state: State, how: Fitting, fixed: int) -> tuple[S
     return state, tuple(dropped)
 
 
-def rests(state: State, place: int) -> bool:
-    """Whether the coefficients of an adopted model explain most, in noise of the colour of what they leave: a last step
-    that is larger than they are was not taken.
-
-    Where noise of that colour would have others, and noise of the colour that those leave would have these, neither
-    explains the residual.
-    """
-    assert state.estimate is not None
-    own = slices(state)[place]
-    step, covariance = state.estimate.theta[own], state.estimate.covariance[own, own]
-    std = np.sqrt(np.maximum(np.diag(covariance), 0.0)) + ROUNDED
-    asked, held = np.abs(step) / std, np.abs(state.theta[place]) / std
-    return bool(asked.max() < MOST_STEP or np.linalg.norm(asked) < np.linalg.norm(held))
-
-
 def agrees(state: State, place: int) -> bool:
-    """Whether the coefficients of an adopted model are what its settings assume."""
+    """Whether the coefficients of an adopted model are what its settings assume, and explain what they then must."""
     model = state.adopted[place]
-    return model.component.agrees is None or model.component.agrees(model.settings, state.theta[place])
+    test = model.component.agrees
+    return test is None or test(model.settings, state.theta[place], explained(state, place))
+
+
+def explained(state: State, place: int) -> float:
+    """The share of |b| - F that an adopted model explains, of what lasts from one sample to the next: white noise, in
+    which there is nothing to explain, has no part in it. 1 without a total field, or where nothing lasts."""
+    assert state.terms is not None
+    own = slices(state)[place]
+    mine = state.terms.only(range(own.start, own.stop))
+    without, left = put_back(state.residual, mine, state.theta[place]).along, state.residual.along
+    if without is None or left is None:
+        return 1.0
+    lasting = without[1:] @ without[:-1]
+    its = without - left
+    both = 0.5 * (without[1:] @ its[:-1] + without[:-1] @ its[1:])
+    return float(both / lasting) if lasting > 0 else 1.0
 
 
 def without_models(record: Record, state: State, places: Sequence[int], how: Fitting) -> State:

@@ -15,7 +15,7 @@ from magtensor.components import Component
 from magtensor.errors import DataError
 from magtensor.loop.adopting import adopt, narrowed, polished
 from magtensor.loop.changing_matrix import channel_instead
-from magtensor.loop.contribution import agrees, eliminate, rests, without_models
+from magtensor.loop.contribution import agrees, eliminate, without_models
 from magtensor.loop.exchange import looked_at_again, simpler
 from magtensor.loop.excitation import Excitation
 from magtensor.loop.found import Search, Step
@@ -234,8 +234,6 @@ def _kept(record: Record, before: Trial, chosen: Candidate, how: Fitting) -> tup
     model = after.state.adopted[which]
     if not agrees(after.state, which):
         return None, "fitted, its coefficients are not what its settings assume"
-    if not rests(after.state, which):
-        return None, "fitted, its coefficients do not rest: noise of another colour wants others"
     if not before.likelier(after):
         return None, "fitted together with the others, it leaves more than it takes away"
     if any(isinstance(grid, EventTimes) for grid in profiled(model.component).values()):
