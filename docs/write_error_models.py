@@ -7,7 +7,17 @@ from pathlib import Path
 
 from magtensor.components import Component
 from magtensor.loop.example import example_survey
-from magtensor.loop.settings import AnyChannel, Choice, Delays, Duration, EventTimes, Forms, Frequencies, Range
+from magtensor.loop.settings import (
+    AnyChannel,
+    Beginning,
+    Choice,
+    Delays,
+    Duration,
+    EventTimes,
+    Forms,
+    Frequencies,
+    Range,
+)
 from magtensor.registry import Registry
 
 PAGE = Path(__file__).with_name("error_models.md")
@@ -41,7 +51,7 @@ every recipe.
 - It returns `Terms`, most simply by `x.offsets` (a series on every axis), `x.scales` (a series times each axis's own
   output), `x.responses` (a series for each axis), `x.matrices` (a vector through nine coefficients a sensor),
   `x.one_each` (one coefficient a sensor), `x.shared` (one for all), `x.on_reference`; `joined` puts several together.
-- Keyword parameters are settings: a type, how it is profiled (`Range`, `Choice`, `Forms`, `AnyChannel`,
+- Keyword parameters are settings: a type, how it is profiled (`Range`, `Choice`, `Forms`, `Beginning`, `AnyChannel`,
   `EventTimes`, `Frequencies`, `Duration`), a description, and a default.
 - `needs` names what it cannot do without: channels (`current_*`), `attitude`, `position`, `total_field`, `rotation`
   (samples dense enough for rates of change), `gradient` (a field that differs between the sensors); `a|b` where one of
@@ -120,6 +130,8 @@ def _in_words(mark: object) -> str:
         return f"{mark.count} times in the survey"
     if isinstance(mark, Frequencies):
         return f"the {mark.count} strongest lines of the residual's spectrum, the best refined"
+    if isinstance(mark, Beginning):
+        return "0; fitted once it is adopted with a lag, if that is better, and anew on another survey"
     if isinstance(mark, Duration):
         return "the survey's duration"
     return type(mark).__name__

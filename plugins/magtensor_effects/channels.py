@@ -8,7 +8,7 @@ from pydantic import Field
 from magtensor.calibration.types import Array
 from magtensor.components import error_model
 from magtensor.loop.excitation import AXES, Excitation
-from magtensor.loop.settings import AnyChannel, Choice, Forms, Frequencies, Range
+from magtensor.loop.settings import AnyChannel, Beginning, Choice, Forms, Frequencies, Range
 from magtensor.loop.terms import Terms, joined
 from magtensor.units import convert
 
@@ -27,6 +27,12 @@ Smooth = Annotated[
     Field(
         description="true: without the noise of the channel's log, as far as its smooth course tells; false: as logged"
     ),
+]
+
+AtStart = Annotated[
+    float,
+    Beginning(),
+    Field(description="by how much the lagged channel exceeded its first reading when the survey began"),
 ]
 
 
@@ -79,6 +85,7 @@ def channel_response(
     ] = 0.0,
     smooth: Smooth = False,
     delayed: Delayed = False,
+    at_start: AtStart = 0.0,
     times_field: Annotated[
         bool,
         Choice((False, True)),
@@ -92,7 +99,7 @@ def channel_response(
     one at power 1.
     """
     name = ANY.pick(x, channel)
-    course = x.channel(name, lag_s, delayed, smooth) ** power
+    course = x.channel(name, lag_s, delayed, smooth, at_start) ** power
     per_unit = f"({x.units[name]})^{power}" if power > 1 else x.units[name]
     if not x.is_vector(name):
         return x.scales(1e-6 * course, f"ppm/{per_unit}") if times_field else x.offsets(course, f"nT/{per_unit}")

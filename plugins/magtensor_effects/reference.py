@@ -1,6 +1,7 @@
 """Error models of the reference total field: base station, its clock, its place."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Annotated, Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from magtensor.loop.settings import Delays
 from magtensor.loop.terms import Terms, joined
 from magtensor_effects.ageing import EventTime, Order, Span, courses
 
+MOST_EXCESS = 0.75  # of the recorded variation: four times that of the site
 NEARBY_S = 2.0  # shorter delays show as the slope over this time
 LONGEST_S = 7200.0  # two time zones
 BETWEEN_NOISE_AND_DELAY = 0.75  # of the lag: half of it is what noise makes, all of it a delay
@@ -23,10 +25,11 @@ def _more_than_noise(_: Mapping[str, Any], coefficients: Array, explained: float
 
     Noise w beside a variation v is recorded and not seen at the site: the excess is fitted as k = w^2 / (v^2 + w^2) and
     explains the share k of the residual, which is w, whatever the weights; a true excess explains all that is not of
-    the sensors. Half way between is sqrt(k), and twice the share is beyond the chance likeness of v and w.
+    the sensors. Half way between is sqrt(k), and twice the share is beyond the chance likeness of v and w; near 1 the
+    two are one.
     """
     excess = 0.01 * float(coefficients[0])
-    return excess <= 0.0 or (explained > min(np.sqrt(excess), 2.0 * excess) and excess < 1.0)
+    return excess <= 0.0 or (excess < MOST_EXCESS and explained > min(np.sqrt(excess), 2.0 * excess))
 
 
 @error_model(
@@ -112,6 +115,8 @@ def reference_drift(x: Excitation, *, order: Order = 1, span_s: Span = 3600.0) -
 def reference_step(x: Excitation, *, time_s: EventTime = 0.0) -> Terms:
     """The base station was moved or retuned: its total field jumps at a time.
 
-    One coefficient. Rival: a jump of all scale factors, which nothing else would tell from it.
+    One coefficient; the jump lies between two of the station's readings, and the field in between is interpolated.
+    Rival: a jump of all scale factors, which nothing else would tell from it.
     """
-    return x.on_reference((x.elapsed >= time_s).astype(float), "nT", "step")
+    since = (x.readings.time - x.start >= time_s).astype(float)
+    return x.on_reference(replace(x.readings, field=since).at(x.time), "nT", "step")

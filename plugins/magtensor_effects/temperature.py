@@ -8,7 +8,7 @@ from magtensor.components import error_model
 from magtensor.loop.excitation import Excitation
 from magtensor.loop.settings import AnyChannel, Orders, Range
 from magtensor.loop.terms import Terms, joined
-from magtensor_effects.channels import Delayed
+from magtensor_effects.channels import AtStart, Delayed
 
 THERMOMETER = AnyChannel("temperature*", or_units="degC", vectors=False)
 
@@ -31,7 +31,13 @@ ThermalLag = Annotated[
     pointwise=True,
 )
 def temperature_offset(
-    x: Excitation, *, order: Order = 1, channel: Thermometer = "", lag_s: ThermalLag = 0.0, delayed: Delayed = False
+    x: Excitation,
+    *,
+    order: Order = 1,
+    channel: Thermometer = "",
+    lag_s: ThermalLag = 0.0,
+    delayed: Delayed = False,
+    at_start: AtStart = 0.0,
 ) -> Terms:
     """Each axis's offset follows the temperature of the sensor, which lags the thermometer.
 
@@ -41,7 +47,7 @@ def temperature_offset(
     short lags.
     """
     name = THERMOMETER.pick(x, channel)
-    course = x.thermometer(name, lag_s, delayed)
+    course = x.thermometer(name, lag_s, delayed, at_start)
     return joined([x.offsets(course**k, f"nT/{units}", label) for k, units, label in _powers(x.units[name], order)])
 
 
@@ -53,7 +59,13 @@ def temperature_offset(
     pointwise=True,
 )
 def temperature_scale(
-    x: Excitation, *, order: Order = 1, channel: Thermometer = "", lag_s: ThermalLag = 0.0, delayed: Delayed = False
+    x: Excitation,
+    *,
+    order: Order = 1,
+    channel: Thermometer = "",
+    lag_s: ThermalLag = 0.0,
+    delayed: Delayed = False,
+    at_start: AtStart = 0.0,
 ) -> Terms:
     """Each axis's scale factor follows the temperature of the sensor, which lags the thermometer.
 
@@ -61,7 +73,7 @@ def temperature_scale(
     `temperature_offset` where the attitude hardly changes; `scale_drift` where the temperature rises steadily.
     """
     name = THERMOMETER.pick(x, channel)
-    course = x.thermometer(name, lag_s, delayed)
+    course = x.thermometer(name, lag_s, delayed, at_start)
     powers = _powers(x.units[name], order)
     return joined([x.scales(1e-6 * course**k, f"ppm/{units}", label) for k, units, label in powers])
 

@@ -92,3 +92,20 @@ def test_a_base_station_that_sees_another_variation_is_found(excess: float, tmp_
     assert [a["error_model"] for a in told["adopted"]] == ["reference_scale"]
     found = told["adopted"][0]["coefficients"][0]
     assert found["value"] == pytest.approx(100 * excess, abs=max(5 * found["std"], 2.0))
+
+
+@pytest.mark.parametrize(("jump_nT", "every_s"), [(3.0, 2.0), (30.0, 2.0), (5.0, 10.0)])
+def test_a_jump_of_the_base_station_lies_between_its_readings(jump_nT: float, every_s: float, tmp_path: Path) -> None:
+    def moved(path: Path) -> None:
+        with h5py.File(path, "a") as file:
+            field = file["reference/total_field"]
+            field[:] = field[:] + jump_nT * (file["reference/time"][:] >= 700.0)
+
+    survey = scenario(47)
+    survey["base_station"]["rate_Hz"] = 1.0 / every_s
+    told = verdict_of(tmp_path, survey, moved, ["reference_step", "scale_step", "reference_scale", "passing_source"])
+    assert [a["error_model"] for a in told["adopted"]] == ["reference_step"], told["unexplained"]["description"]
+    found = told["adopted"][0]
+    assert found["coefficients"][0]["value"] == pytest.approx(jump_nT, abs=0.1)
+    assert found["settings"]["time_s"] == pytest.approx(700.0, abs=every_s + 1.0)
+    assert not told["unexplained"]["present"], told["unexplained"]["description"]

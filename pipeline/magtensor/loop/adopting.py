@@ -10,6 +10,7 @@ import numpy as np
 
 from magtensor.loop.assessment import estimated, explained
 from magtensor.loop.contribution import KEEP_ALPHA, put_back, significance, slices
+from magtensor.loop.equilibrium import beginning, extent
 from magtensor.loop.gates import Candidate
 from magtensor.loop.model import Adopted, Fitting, Record, State, joint_state
 from magtensor.loop.profiling import golden
@@ -107,9 +108,9 @@ def _sensors_showing(state: State, which: int) -> tuple[str, ...] | None:
 
 
 def polished(record: Record, state: State, how: Fitting) -> State:
-    """The forms of the models and their settings on a range, sought once more now that everything is fitted together; a
-    setting that is a little off leaves a residual that another model would be adopted for."""
-    state = _in_their_forms(record, state, how)
+    """The forms of the models, what they began with and their settings on a range, sought once more now that everything
+    is fitted together; a setting that is a little off leaves a residual that another model would be adopted for."""
+    state = _as_they_began(record, _in_their_forms(record, state, how), how)
     for _ in range(_SWEEPS):
         moved = False
         for number, model in enumerate(state.adopted):
@@ -148,6 +149,45 @@ def _in_their_forms(record: Record, state: State, how: Fitting) -> State:
         if best != model.settings:
             state = _changed(record, state, number, best, how)
     return state
+
+
+def _as_they_began(record: Record, state: State, how: Fitting) -> State:
+    """Every lagged model with what it had from before the survey began, where the data separate it from nothing."""
+    for number, model in enumerate(state.adopted):
+        found = beginning(model.component, model.settings)
+        if found is None or not found[1].matters(model.settings):
+            continue
+        name, mark = found
+        gain = _gain_beside_the_others(state, number)
+        widest = extent(model.component, model.settings, state.excitation)
+        best = _with_beginning(gain, model.settings, name, mark.lag, widest)
+        at_rest = {**model.settings, name: 0.0}
+        if gain(best) <= gain(at_rest) + SEPARATION:  # of two settings that were free
+            best = at_rest
+        if best != model.settings:
+            state = _changed(record, state, number, best, how)
+    return state
+
+
+def _with_beginning(
+    gain: Callable[[Mapping[str, Any]], float], settings: Mapping[str, Any], name: str, lag: str, widest: float
+) -> dict[str, Any]:
+    """Settings with the best beginning within limits, and the lag that goes with it."""
+    from scipy.optimize import minimize_scalar
+
+    best = dict(settings)
+
+    def loss(value: float) -> float:
+        return -gain({**best, name: value})
+
+    for _ in range(_SWEEPS):
+        found = minimize_scalar(loss, bounds=(-widest, widest), method="bounded", options={"xatol": 4e-4 * widest})
+        best[name] = float(found.x)
+        before = best[lag]
+        best[lag] = _near(gain, best, lag, (1.0 - POLISH) * before)
+        if abs(best[lag] - before) <= _RESTS * before:
+            break
+    return best
 
 
 def _suited(

@@ -10,12 +10,11 @@ from numpy.typing import NDArray
 
 from magtensor.calibration.by_sensor import by_sensor
 from magtensor.calibration.types import Array, ArrayCalibration
+from magtensor.loop.beginnings import as_begun_here
 from magtensor.loop.model import Adopted, Record, State, without
 from magtensor.loop.waveform import NAME, course_of
 from magtensor.tensor.geometry import array_design
 
-TONE = "periodic_interference"
-LEAST_CONTRAST = 1e-4  # of a tone's own power, between the sensors
 MOST_STEPS = 8
 SETTLED_NT = 1e-4
 
@@ -50,7 +49,7 @@ def corrected_raw(
     raw = record.raw
     if not own:
         return raw
-    own = [(a, _as_it_is_here(record, calibration, a, t) if a.name == TONE else t) for a, t in own]
+    own = as_begun_here(record, calibration, own)
     forward = np.linalg.inv(calibration.matrix)
     for _ in range(MOST_STEPS):
         b = calibration.apply(raw)
@@ -64,43 +63,6 @@ def corrected_raw(
         if moved < SETTLED_NT:
             break
     return raw
-
-
-def _as_it_is_here(record: Record, calibration: ArrayCalibration, model: Adopted, theta: Array) -> Array:
-    """Coefficients of a tone with the phase and strength it has on this survey; what one survey began with is another's
-    accident.
-
-    Found by least squares over the tone as it was and a quarter of a turn later, in what neither a uniform field nor a
-    gradient can make of the outputs (with fewer than four sensors: in their differences). A single sensor, and a tone
-    that all sensors see alike, leave it unknown, and nothing is taken off.
-    """
-    usable: NDArray[np.bool_] = np.asarray(np.isfinite(record.raw).all(axis=(1, 2)))
-    raw = np.where(usable[:, None, None], record.raw, 0.0)
-    terms = model.terms(record.excitation(raw, raw))
-    half = len(theta) // 2  # cosines first, then sines
-    later = np.concatenate([theta[half:], -theta[:half]])
-
-    sensors = raw.shape[1]
-    held = np.tile(np.eye(3), (sensors, 1))
-    if record.position is not None and sensors > 3:
-        held = array_design(record.position, "gradient")
-    free = np.eye(3 * sensors) - held @ np.linalg.pinv(held, rcond=1e-9)
-
-    def contrast(outputs: Array) -> Array:
-        b = by_sensor(calibration.matrix, outputs)[usable]
-        out: Array = (b.reshape(len(b), -1) @ free).ravel()
-        return out
-
-    size = raw[0].size
-    both = np.column_stack([contrast(terms.contribution(t, size).reshape(raw.shape)) for t in (theta, later)])
-    if np.sum(both**2) <= LEAST_CONTRAST * usable.sum() * float(theta @ theta):
-        return np.zeros_like(theta)
-    strengths = np.linalg.svd(both.T @ both, compute_uv=False)
-    if strengths[1] < LEAST_CONTRAST * strengths[0]:  # a tone that the sampling shows as a constant has no phase
-        return theta
-    own = np.linalg.lstsq(both, contrast(raw - calibration.offset), rcond=1e-6)[0]
-    out: Array = own[0] * theta + own[1] * later
-    return out
 
 
 def hidden_waveform(

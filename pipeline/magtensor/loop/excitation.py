@@ -126,21 +126,31 @@ class Excitation:
         """The logged channels whose names fit."""
         return sorted(n for n in self.logged if fnmatchcase(n, pattern) and not any(fnmatchcase(n, w) for w in without))
 
-    def channel(self, name: str, lag_s: float = 0.0, delayed: bool = False, smooth: bool = False) -> Array:
+    def channel(
+        self, name: str, lag_s: float = 0.0, delayed: bool = False, smooth: bool = False, at_start: float = 0.0
+    ) -> Array:
         """A logged channel, (N,), (N, S) or (N, 3), seen through a lag as in `lagged`, or later by it as a whole;
-        `smooth`: without the noise of its log.
+        `smooth`: without the noise of its log. `at_start`: by how much the lagged one exceeded its first reading then;
+        taken for 0 where it is not known.
 
         Raises:
             KeyError: there is none of that name.
         """
         if name not in self.logged:
             raise KeyError(f"no channel {name}{did_you_mean(name, self.logged)}")
-        return self._course(name, lag_s, delayed, smooth) if lag_s or smooth else self.logged[name]
+        if not (lag_s or smooth):
+            return self.logged[name]
+        seen = self._course(name, lag_s, delayed, smooth)
+        if lag_s <= 0 or delayed or not at_start or np.isnan(at_start):
+            return seen
+        whole = self.part_of[0] if self.part_of else self
+        gone = np.exp((whole.time[0] - self.time) / lag_s)
+        return seen + at_start * gone.reshape(-1, *[1] * (seen.ndim - 1))
 
-    def thermometer(self, name: str, lag_s: float = 0.0, delayed: bool = False) -> Array:
+    def thermometer(self, name: str, lag_s: float = 0.0, delayed: bool = False, at_start: float = 0.0) -> Array:
         """A logged temperature without the noise of its log, seen through a lag as in `channel`: what has a thermal
         mass does not jump, neither between samples nor where a log that is written seldom has a new value."""
-        return self._course(name, lag_s, delayed, smooth=True)
+        return self.channel(name, lag_s, delayed, smooth=True, at_start=at_start)
 
     def _course(self, name: str, lag_s: float, delayed: bool, smooth: bool) -> Array:
         if self.part_of is not None:

@@ -22,7 +22,7 @@ from magtensor.loop.assessment import Assessment, estimated
 from magtensor.loop.colour import beside_the_field
 from magtensor.loop.direction import attitude_series
 from magtensor.loop.factor import Factors, Groups, noise_alone, with_factor
-from magtensor.loop.gates import LOG_MARGIN, SECOND_ORDER, Candidate, explained_before
+from magtensor.loop.gates import LOG_MARGIN, OF_THE_LAW, Candidate, explained_before
 from magtensor.loop.likeness import effect_along, followed
 from magtensor.loop.log_noise import brought_in
 from magtensor.loop.model import Adopted, Fitting, Record, State, excitation_of, joint_state, without
@@ -110,8 +110,8 @@ def sought(state: State, record: Record) -> Sought | None:
     objection = left_by = ""
     if not told:
         objection = "with two sensors it cannot be told from a disturbance of one of them"
-    elif n * float(seen @ seen) <= SECOND_ORDER * explained_before(state):
-        objection = "it is less than 0.3 % of what is adopted, whose next order may leave it"
+    elif n * float(seen @ seen) <= OF_THE_LAW * explained_before(state):
+        objection = "it is less than 5 % of what is adopted, whose laws may leave it"
     elif not gain.consistent:
         objection = "the sensors do not predict each other with it on held-out stretches"
     elif like is not None:

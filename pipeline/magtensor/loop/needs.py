@@ -11,11 +11,11 @@ from collections.abc import Callable
 import numpy as np
 
 from magtensor.components import Component
-from magtensor.loop.excitation import Excitation, derivative_of
+from magtensor.loop.excitation import SPLINED, Excitation, derivative_of
 from magtensor.loop.settings import AnyChannel
 
 LARGEST_TURN = 0.5  # rad between neighbouring samples above which rates of change mean nothing
-LEAST_IN_A_RUN = 8  # samples that show a rate of change, and whether it is right
+LEAST_IN_A_RUN = 2 * SPLINED - 1  # samples that show a rate of change, and every second of them whether it is right
 WORST_RATE = 0.5  # of the rate of change, moved by leaving out every second sample; with all of them the error of a
 # difference formula is then some tenths of that, where the attitudes are unrelated all of it and more
 

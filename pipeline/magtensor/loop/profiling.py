@@ -12,6 +12,7 @@ from magtensor.calibration.types import Array
 from magtensor.components import Component
 from magtensor.errors import UsageError
 from magtensor.loop.assessment import WHITE, colours_of, estimated, likeliest
+from magtensor.loop.equilibrium import begun
 from magtensor.loop.excitation import Excitation
 from magtensor.loop.model import State, regressors
 from magtensor.loop.multiplicity import alike, effective_tests, projected
@@ -28,6 +29,8 @@ BATCH_ENTRIES = 130_000  # numbers in the series that are worked on together
 MOST_OF_IT = 0.75  # of what a model explains, if it is to be made about other settings
 _REFINEMENTS = 8
 _OF_A_LINE = 16  # to a thousandth of its width
+_GOLDEN = 0.4812  # log of what a step of a golden section divides by
+_SAMPLES_ABOUT = 6  # to either side of an event's time in white noise
 
 
 def repeatable(model: Component) -> bool:
@@ -173,7 +176,7 @@ def _batches(made: Iterable[tuple[dict[str, Any], Terms]]) -> Iterator[list[tupl
 
 def refined(model: Component, settings: dict[str, Any], state: State, failed: dict[str, str]) -> dict[str, Any]:
     """Settings on a range, moved between the neighbours of the best grid value by golden section; a lag of none stays
-    one where the data do not separate the two."""
+    one where the data do not separate the two, and so does a response in equilibrium at the survey's start."""
     few = thinned(state, REFINING_SAMPLES)
     for name, grid in profiled(model).items():
         if not isinstance(grid, (Range, EventTimes, Frequencies)):
@@ -187,20 +190,54 @@ def refined(model: Component, settings: dict[str, Any], state: State, failed: di
         together = terms if given is None else joined([given, terms])
         score = Scorer(residual, given, likeliest(residual, together, [colours_of(residual), WHITE]).colours)
 
-        def gain(value: float, name: str = name, score: Scorer = score, rest: dict[str, Any] = settings) -> float:
+        def at(value: float, name: str = name, rest: dict[str, Any] = settings) -> Terms | None:
             found = terms_of(model, {**rest, name: value}, state.excitation, failed)
-            return -np.inf if found is None else score(found.at(few[0].samples))
+            return None if found is None else found.at(few[0].samples)
+
+        def gain(value: float, score: Scorer = score, at: Callable[[float], Terms | None] = at) -> float:
+            found = at(value)
+            return -np.inf if found is None else score(found)
 
         best = settings[name]
         finer = grid.between(low, high) if isinstance(grid, Range) else []
         if len(finer) > 1:
             best = max([best, *finer], key=gain)
             low, high = best - (finer[1] - finer[0]), best + (finer[1] - finer[0])
-        best = golden(gain, low, high, best, _OF_A_LINE if isinstance(grid, Frequencies) else _REFINEMENTS)
+        if isinstance(grid, EventTimes):
+            best = _its_time(gain, Scorer(residual, given, WHITE), at, (low, high), best, state.excitation.spacing)
+        else:
+            best = golden(gain, low, high, best, _OF_A_LINE if isinstance(grid, Frequencies) else _REFINEMENTS)
         if low <= 0.0 <= high and _of_ratios(grid) and gain(best) - gain(0.0) < SEPARATION / 2.0:
             best = 0.0
         settings = {**settings, name: best}
+    settings = begun(model, settings, state, few)
     return _about_what_it_fits(model, settings, state, failed) if model.about is not None else settings
+
+
+def _its_time(
+    gain: Callable[[float], float],
+    white: Scorer,
+    at: Callable[[float], Terms | None],
+    limits: tuple[float, float],
+    best: float,
+    spacing: float,
+) -> float:
+    """The time of an event between limits, s, to a sample.
+
+    In white noise the way to it rises from afar. In noise of the colour that a large jump leaves only the very sample
+    explains anything: there it is sought among the samples about the time found in white noise.
+    """
+    low, high = limits
+
+    def in_white(value: float) -> float:
+        found = at(value)
+        return -np.inf if found is None else white(found)
+
+    steps = int(np.clip(np.ceil(np.log(max((high - low) / spacing, 2.0)) / _GOLDEN), _REFINEMENTS, _OF_A_LINE))
+    about = golden(in_white, low, high, best, steps)
+    near = about + spacing * np.arange(-_SAMPLES_ABOUT, _SAMPLES_ABOUT + 1)
+    from_afar = golden(gain, low, high, best)
+    return max((float(v) for v in (best, from_afar, *near)), key=gain)
 
 
 def _around(grid: Range | EventTimes | Frequencies, value: float, x: Excitation) -> tuple[float, float]:

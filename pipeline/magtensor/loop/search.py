@@ -19,7 +19,7 @@ from magtensor.loop.contribution import agrees, eliminate, without_models
 from magtensor.loop.exchange import looked_at_again, simpler
 from magtensor.loop.excitation import Excitation
 from magtensor.loop.found import Search, Step
-from magtensor.loop.gates import ALPHA, SECOND_ORDER, Candidate
+from magtensor.loop.gates import ALPHA, OF_THE_LAW, SECOND_ORDER, Candidate
 from magtensor.loop.latent import NAME, Sought, Source, renewed, sought, tried_source
 from magtensor.loop.model import Adopted, Fitting, Record, State, joint_state
 from magtensor.loop.needs import missing
@@ -27,7 +27,7 @@ from magtensor.loop.overshadowed import overshadowed
 from magtensor.loop.profiling import repeatable
 from magtensor.loop.screening import candidates_of, generic
 from magtensor.loop.separation import SEPARATION, fold_gain, separated
-from magtensor.loop.settings import EventTimes, profiled
+from magtensor.loop.settings import AnyChannel, EventTimes, profiled
 from magtensor.loop.spectrum import spectral_lines
 from magtensor.loop.trial import Trial, on_the_folds_of, per_sample, trial
 
@@ -292,7 +292,8 @@ def _containing(best: Candidate, possible: Sequence[Candidate], state: State) ->
 def simplest(best: Candidate, possible: Sequence[Candidate], state: State) -> tuple[Candidate, tuple[str, ...]]:
     """The simplest of the models that the held-out blocks do not separate from the best, and the others' names.
 
-    Nor are two told apart by less than the next order of what both explain.
+    Nor are two told apart by less than the next order of what both explain, and a channel that nobody wrote a model for
+    from the model that names its effect by less than that one's law may miss.
     Simplest is more of what was adopted already, with another setting; then what has the fewest coefficients.
     A model that slow noise could explain is named, and not chosen before one that it could not.
     """
@@ -304,7 +305,8 @@ def simplest(best: Candidate, possible: Sequence[Candidate], state: State) -> tu
             continue
         spare = max(other.assessment.estimate.rank - best.assessment.estimate.rank, 0)
         found = fold_gain(state, colours, other.terms)
-        alike = reference.over(found).total <= SECOND_ORDER * reference.total
+        named = generic(best.model) and not generic(other.model) and _channel(best) == _channel(other)
+        alike = reference.over(found).total <= (OF_THE_LAW if named else SECOND_ORDER) * reference.total
         if alike or not separated(reference, found, spare):
             equal.append(other)
     known = {a.name for a in state.adopted}
@@ -314,6 +316,12 @@ def simplest(best: Candidate, possible: Sequence[Candidate], state: State) -> tu
 
     chosen = min((c for c in equal if c is best or c.passes), key=complexity)
     return chosen, tuple(sorted({c.model.name for c in equal if c is not chosen} - {chosen.model.name}))
+
+
+def _channel(candidate: Candidate) -> str:
+    """The channel that a model follows; "" where it follows none."""
+    settings, marks = candidate.model.settings, profiled(candidate.model.component).items()
+    return next((str(settings[name]) for name, mark in marks if isinstance(mark, AnyChannel)), "")
 
 
 def with_lines(state: State, record: Record, lines: Sequence[float] | None = None) -> State:

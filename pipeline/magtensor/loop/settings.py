@@ -6,6 +6,7 @@ channel: Annotated[str, AnyChannel("current_*")]
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -161,6 +162,32 @@ class Forms(Choice):
     def values(self, x: Excitation) -> list[Any]:
         """The first."""
         return list(self.options[:1])
+
+
+@dataclass(frozen=True)
+class Beginning:
+    """What a response that lags had from before the survey began, in the units of its channel.
+
+    The search takes it to begin in equilibrium; of an adopted model it is fitted where the data separate the two. It is
+    no part of the calibration: what another survey began with is found from its own outputs.
+
+    Attributes:
+        lag, unless: the settings that are the lag, and that say of it that it is none.
+    """
+
+    lag: str = "lag_s"
+    unless: str = "delayed"
+
+    def values(self, x: Excitation) -> list[Any]:
+        """Equilibrium."""
+        return [0.0]
+
+    def matters(self, settings: Mapping[str, Any]) -> bool:
+        """Whether there is a lag for these settings."""
+        return bool(settings[self.lag] > 0 and not settings[self.unless])
+
+
+NOT_KNOWN = float("nan")  # what the response had when a survey began that the model was not fitted to
 
 
 @dataclass(frozen=True)

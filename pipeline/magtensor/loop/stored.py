@@ -12,11 +12,12 @@ import numpy as np
 
 from magtensor.calibration.types import Array, ArrayCalibration
 from magtensor.errors import DataError, UsageError
-from magtensor.loop.correction import TONE, corrected_raw, corrected_reference
+from magtensor.loop.beginnings import TONE, shows_a_state
+from magtensor.loop.correction import corrected_raw, corrected_reference
 from magtensor.loop.model import Adopted, Record
 from magtensor.loop.needs import FACTS
 from magtensor.loop.record import record_of
-from magtensor.loop.settings import AnyChannel, Duration, EventTimes, profiled
+from magtensor.loop.settings import NOT_KNOWN, AnyChannel, Beginning, Duration, EventTimes, profiled
 from magtensor.loop.waveform import NAME
 from magtensor.registry import Registry
 from magtensor.survey.model import Survey, Variable
@@ -75,7 +76,8 @@ def stored_effects(calibration: Survey, registry: Registry) -> tuple[list[Adopte
 def on_its_clock(adopted: Sequence[Adopted], calibration: Survey, survey: Survey) -> list[Adopted]:
     """Effects of a calibration as they are on another survey: what happened at a time has happened since then.
 
-    A jump stays, and a drift holds its last value. Warming up begins anew with every survey.
+    A jump stays, and a drift holds its last value. Warming up begins anew with every survey, and what a lagged response
+    began with is another survey's own.
     """
     begun = calibration["calibration/effects"].attrs.get("start") if adopted else None
     return list(adopted) if begun is None else begun_with(adopted, datetime.fromisoformat(str(begun)), survey)
@@ -84,7 +86,15 @@ def on_its_clock(adopted: Sequence[Adopted], calibration: Survey, survey: Survey
 def begun_with(adopted: Sequence[Adopted], begun: datetime, survey: Survey) -> list[Adopted]:
     """Effects of a survey that began at some date, on the clock of another survey."""
     seconds = (begun - started(survey)).total_seconds() + float(survey.time[0])
+    if seconds != float(survey.time[0]) or shows_a_state(survey.values("b_raw"), "position" in survey):
+        adopted = [_begun_unknown(a) for a in adopted]
     return [replace(a, start=seconds) if _of_a_time(a) else a for a in adopted]
+
+
+def _begun_unknown(model: Adopted) -> Adopted:
+    grids = profiled(model.component).items()
+    began = {n: NOT_KNOWN for n, g in grids if isinstance(g, Beginning) and g.matters(model.settings)}
+    return replace(model, settings={**model.settings, **began}) if began else model
 
 
 def _of_a_time(model: Adopted) -> bool:

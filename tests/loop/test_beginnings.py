@@ -1,0 +1,54 @@
+"""A response that lags, and began out of equilibrium: on the survey, and on another one that it is applied to."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from loop_cases import lasting_effects, scenario, survey_file
+
+from magtensor import close_loop
+from magtensor.loop.example import example_survey
+from magtensor.registry import Registry
+
+TAU_S = 150.0
+PER_DEGREE = np.array([[0.3, -0.1, 0.2], [0.15, 0.3, -0.2], [-0.2, 0.1, 0.3], [0.05, -0.3, 0.15]])  # nT/degC
+
+
+def warmed(folder: Path, seed: int, first_degC: float) -> Path:
+    """A survey whose offsets follow a body behind the thermometer, at the start so much warmer than that."""
+    path = survey_file(folder, scenario(seed), f"{seed}.h5")
+    with h5py.File(path, "a") as file:
+        time, air = file["time"][:], file["temperature"][:]
+        body = np.empty_like(air)
+        body[0] = air[0] + first_degC
+        for i in range(1, len(air)):  # Euler's steps, a hundredth of the lag or shorter
+            body[i] = body[i - 1] + (time[i] - time[i - 1]) / TAU_S * (air[i - 1] - body[i - 1])
+        file["b_raw"][:] = file["b_raw"][:] + body[:, None, None] * PER_DEGREE
+    return path
+
+
+def test_a_lagged_channel_begins_where_it_is_said_to() -> None:
+    x = example_survey(Registry.load().find("error_model", "temperature_offset"))
+    rest, warm = (x.channel("temperature", 60.0, at_start=v) for v in (0.0, 2.5))
+    np.testing.assert_allclose(warm - rest, 2.5 * np.exp(-(x.time - x.time[0]) / 60.0), rtol=1e-9, atol=1e-12)
+    for unmoved in ({"delayed": True, "at_start": 2.5}, {"delayed": True}):
+        np.testing.assert_array_equal(
+            x.channel("temperature", 60.0, **unmoved), x.later(x.channel("temperature"), 60.0)
+        )
+    np.testing.assert_array_equal(x.channel("temperature", 60.0, at_start=np.nan), rest)
+
+
+@pytest.mark.parametrize(("first", "second"), [(3.0, -6.0), (0.0, 9.0), (-3.0, 0.0)])
+def test_what_the_sensors_had_from_before_is_no_second_effect(first: float, second: float, tmp_path: Path) -> None:
+    survey, other = warmed(tmp_path, 61, first), warmed(tmp_path, 62, second)
+    told = close_loop(survey, verify=other, search=lasting_effects()).verdict
+    assert [a["error_model"] for a in told["adopted"]] == ["temperature_offset"], told["unexplained"]["description"]
+    settings = told["adopted"][0]["settings"]
+    assert settings["lag_s"] == pytest.approx(TAU_S, rel=0.1)
+    assert settings["at_start"] == pytest.approx(first, abs=0.6)
+    before, after = (told["error"]["verify"][k]["tensor_rms_nT_per_m"]["all"] for k in ("before", "after"))
+    here = told["error"]["held_out"]["after"]["tensor_rms_nT_per_m"]["all"]
+    assert after < 1.1 * here and after < 0.7 * before
