@@ -9,9 +9,9 @@ from datetime import UTC, datetime
 from fnmatch import fnmatchcase
 from typing import TYPE_CHECKING, Any
 
-from magtensor.errors import MagtensorError, UsageError
+from magtensor.errors import MagtensorError, NotEnoughData, UsageError
 from magtensor.recipe.plan import Plan, PlannedStage
-from magtensor.survey.flags import Flag
+from magtensor.survey.flags import Flag, much_lost
 from magtensor.survey.model import Survey, Variable
 
 if TYPE_CHECKING:
@@ -112,6 +112,12 @@ def run_stage(
     try:
         given = (function or stage.component.function)(view, **stage.options)
         after, wrote = _merge(stage, survey, given)
+    except NotEnoughData as error:
+        missing = told_of_reading(survey)
+        if not missing:
+            raise
+        hint = "\n  ".join([*([error.hint] if error.hint else []), *missing])
+        raise type(error)(error.what, where=error.where, hint=hint) from error
     except MagtensorError:
         raise
     except SystemExit as error:
@@ -128,6 +134,15 @@ def run_stage(
         tuple(sorted(wrote)),
     )
     return after, record
+
+
+def told_of_reading(survey: Survey) -> list[str]:
+    """What was noticed while a survey was read, and where much of it is not used, a line each."""
+    lost = much_lost(survey.flags, len(survey.time)) if survey.flags else []
+    return [
+        *(f"as read: {note}" for note in survey.attributes.get("notes", ())),
+        *(f"not used: {line}" for line in lost),
+    ]
 
 
 def _require(stage: PlannedStage, survey: Survey) -> None:

@@ -19,7 +19,7 @@ from magtensor.provenance import Provenance
 from magtensor.qc import told
 from magtensor.recipe.plan import Plan, read_plan
 from magtensor.refusal import picture_named
-from magtensor.runner import RunResult, StageRecord, run
+from magtensor.runner import RunResult, StageRecord, run, told_of_reading
 from magtensor.survey.in_memory import Held
 from magtensor.survey.model import Survey
 from magtensor.survey.source import Source
@@ -158,6 +158,7 @@ class Computed:
         """Write the files of the contract."""
         made_by = result.write(output, self.survey, self.provenance(), self.outcome)
         notes = (
+            *told_of_reading(self.survey),
             *(f"not determined: {words}" for words in left_open(self.survey)),
             *told_of_change(self.survey),
             *told_of_fit(self.survey),

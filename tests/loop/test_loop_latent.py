@@ -246,7 +246,7 @@ def test_what_an_effect_may_have_left_is_no_source(alike: bool) -> None:
     """A waveform that moves the sensors as an adopted effect does, and one that moves them otherwise."""
     pump = np.cos(np.arange(N) / 33.0)
     effect = VECTORS if alike else np.random.default_rng(9).standard_normal((4, 3))
-    record = synthetic(2, N, added=3.0 * WAVE[:, None, None] * VECTORS + 40.0 * pump[:, None, None] * effect)
+    record = synthetic(2, N, added=3.0 * WAVE[:, None, None] * VECTORS + 12.0 * pump[:, None, None] * effect)
     known = replace(record, logged={"pump": pump}, means={"pump": np.zeros(())}, units={"pump": "A"})
     response = Adopted(Registry.load().find("error_model", "channel_response"), {"channel": "pump"})
     state = joint_state(known, [response], Fitting())

@@ -16,14 +16,15 @@ from magtensor.loop.model import State, regressors
 from magtensor.loop.residual import Residual
 from magtensor.loop.scoring import Scorer
 from magtensor.loop.separation import SEPARATION
-from magtensor.loop.settings import AnyChannel, Beginning, profiled
+from magtensor.loop.settings import AnyChannel, Beginning, Orders, profiled
 from magtensor.loop.terms import Terms, joined
 
 
 def beginning(model: Component, settings: Mapping[str, Any]) -> tuple[str, Beginning] | None:
-    """The setting that says what a model began with; None where it has none."""
-    grids = profiled(model).items()
-    return next(((n, g) for n, g in grids if isinstance(g, Beginning) and not settings[g.unless]), None)
+    """The setting that says what a model began with; None where it has none, or the lag is given."""
+    grids = profiled(model)
+    found = ((n, g) for n, g in grids.items() if isinstance(g, Beginning) and g.lag in grids)
+    return next(((n, g) for n, g in found if not settings.get(g.unless)), None)
 
 
 def extent(model: Component, settings: Mapping[str, Any], x: Excitation) -> float:
@@ -39,7 +40,7 @@ def begun(
     those given.
 
     For each lag the coefficients of the channel and of what dies away are fitted freely; the beginning is the part of
-    the first that is in the second.
+    the first that is in the second. Of powers of the channel the lowest alone is asked.
     """
     found = beginning(model, settings)
     if found is None:
@@ -54,10 +55,12 @@ def begun(
 
     white = Whitened.of(residual, WHITE.across, WHITE.along, given, over_time=False)
     score = Scorer(residual, given, WHITE)
-    lags = {settings[mark.lag], *profiled(model)[mark.lag].values(x)}
+    grids = profiled(model)
+    orders = {n: min(g.options) for n, g in grids.items() if isinstance(g, Orders)}  # squares imitate what dies away
+    lags = {settings[mark.lag], *grids[mark.lag].values(x)}
     tried = []
     for lag in sorted(v for v in lags if v > 0):
-        at_rest = {**settings, mark.lag: lag, name: 0.0}
+        at_rest = {**settings, **orders, mark.lag: lag, name: 0.0}
         rest, moved = terms(at_rest), terms({**at_rest, name: widest})
         dying = replace(moved, series=moved.series - rest.series)
         estimate = estimated_in(white, joined([rest, dying]))

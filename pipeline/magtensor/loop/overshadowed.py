@@ -4,8 +4,8 @@ Any law of the attitude resembles any other one a little. Where something large 
 (a gradient of the site, and no attitude logged to know it by), a named law that is a small part of it is significant,
 predicts held-out blocks, and is wrong elsewhere: of the five components of a gradient one looks exactly like a
 quadratic nonlinearity. So an adopted effect that follows the attitude and explains less than what stays unexplained is
-taken out again; and so is what happened once, where the sensors share a larger waveform that has no name: a step or a
-passage may be a part of it.
+taken out again; and so is what happened once, where the sensors share a waveform that has no name and is larger, or
+switches along the same vectors: a step or a passage may be a part of it.
 """
 
 from __future__ import annotations
@@ -46,7 +46,8 @@ def overshadowed(found: Search, fixed: int) -> tuple[str, str] | None:
 
 
 def _part_of_a_source(found: Search, fixed: int) -> tuple[str, str] | None:
-    """An effect that happened once beside a larger waveform of no name, and why it is doubted."""
+    """An effect that happened once beside a waveform of no name that is larger, or of which it may be one switching
+    among several, and why it is doubted."""
     shared, state = found.shared, found.last
     if shared is None or NAME in {a.name for a in state.adopted}:
         return None
@@ -61,7 +62,7 @@ def _part_of_a_source(found: Search, fixed: int) -> tuple[str, str] | None:
         theta = np.zeros(state.terms.count)
         theta[slices(state)[place]] = state.theta[place]
         own = float(np.sqrt(np.mean(state.terms.contribution(theta, shared.direction.size) ** 2)))
-        if own < amount:
+        if own < amount or (shared.switches and shared.left_by == model.name):
             shared_by = f"the waveform that the sensors share ({amount:.3g} nT)"
             return model.name, f"it explains {own:.3g} nT rms and may be a part of {shared_by}"
     return None

@@ -184,7 +184,7 @@ class Beginning:
 
     def matters(self, settings: Mapping[str, Any]) -> bool:
         """Whether there is a lag for these settings."""
-        return bool(settings[self.lag] > 0 and not settings[self.unless])
+        return bool(settings.get(self.lag, 0.0) > 0 and not settings.get(self.unless))
 
 
 NOT_KNOWN = float("nan")  # what the response had when a survey began that the model was not fitted to

@@ -8,6 +8,8 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+MUCH = 0.1  # of a survey's samples: a loss that is told at once
+
 
 @dataclass(frozen=True)
 class Flag:
@@ -73,3 +75,12 @@ def summary(flags: Iterable[Flag]) -> list[str]:
         whose = f" of {', '.join(sensors)}" if sensors else ""
         lines.append(f"{by}: {sum(m.samples for m in members)} samples{whose}: {reason}")
     return lines
+
+
+def much_lost(flags: Iterable[Flag], samples: int) -> list[str]:
+    """The lines of `summary` whose samples are more than a tenth of a survey's, each with how many these are."""
+    members: dict[tuple[str, str], list[Flag]] = {}
+    for flag in flags:
+        members.setdefault((flag.by, flag.reason), []).append(flag)
+    large = [group for group in members.values() if sum(f.samples for f in group) > MUCH * samples]
+    return [f"{line} (of {samples})" for group in large for line in summary(group)]
