@@ -52,3 +52,10 @@ def test_what_the_sensors_had_from_before_is_no_second_effect(first: float, seco
     before, after = (told["error"]["verify"][k]["tensor_rms_nT_per_m"]["all"] for k in ("before", "after"))
     here = told["error"]["held_out"]["after"]["tensor_rms_nT_per_m"]["all"]
     assert after < 1.1 * here and after < 0.7 * before
+
+
+def test_evidence_stays_with_a_model_whose_form_has_moved(tmp_path: Path) -> None:
+    told = close_loop(warmed(tmp_path, 61, 3.0), search=["temperature_offset", "channel_response"]).verdict
+    (adopted,) = told["adopted"]
+    assert adopted["settings"]["at_start"] != 0.0
+    assert adopted["evidence"]["z"] > 4

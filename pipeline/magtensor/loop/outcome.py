@@ -10,7 +10,7 @@ from magtensor.loop.contribution import removal
 from magtensor.loop.found import Search, Step
 from magtensor.loop.gates import Candidate
 from magtensor.loop.model import Adopted, Record
-from magtensor.loop.settings import Range, profiled
+from magtensor.loop.settings import Beginning, Forms, Frequencies, Range, profiled
 from magtensor.loop.waveform import NAME
 
 
@@ -61,15 +61,24 @@ def judgement(candidate: Candidate) -> dict[str, Any]:
 
 
 def _step_of(found: Search, model: Adopted) -> Step | None:
-    """The round in which a model was adopted; its settings on a range were moved since."""
-    moved = {name for name, grid in profiled(model.component).items() if isinstance(grid, Range)}
-    fixed = {k: v for k, v in model.settings.items() if k not in moved}
-    for step in found.steps:
-        if step.adopted is None or step.adopted.model.name != model.name:
-            continue
-        if all(step.adopted.model.settings.get(k) == v for k, v in fixed.items()):
-            return step
-    return None
+    """The round in which a model was adopted; its form, what it began with and its settings on a range were moved
+    since: of several rounds the one with the nearest."""
+    grids = profiled(model.component)
+    ranges = [name for name, grid in grids.items() if isinstance(grid, (Range, Frequencies))]
+    free = {*ranges, *(name for name, grid in grids.items() if isinstance(grid, (Forms, Beginning)))}
+
+    def apart(adopted: Adopted) -> float:
+        pairs = [(float(adopted.settings.get(name, 0.0)), float(model.settings.get(name, 0.0))) for name in ranges]
+        return sum(abs(a - b) / (abs(a) + abs(b)) for a, b in pairs if a != b)
+
+    fitting = [
+        (apart(step.adopted.model), number)
+        for number, step in enumerate(found.steps)
+        if step.adopted is not None
+        and step.adopted.model.name == model.name
+        and all(step.adopted.model.settings.get(k) == v for k, v in model.settings.items() if k not in free)
+    ]
+    return found.steps[min(fitting)[1]] if fitting else None
 
 
 def _adopted(found: Search, index: int) -> dict[str, Any]:
