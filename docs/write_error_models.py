@@ -131,7 +131,7 @@ def _in_words(mark: object) -> str:
     if isinstance(mark, Frequencies):
         return f"the {mark.count} strongest lines of the residual's spectrum, the best refined"
     if isinstance(mark, Beginning):
-        return "0; fitted once it is adopted with a lag, if that is better, and anew on another survey"
+        return "0; fitted together with a lag, if that is better, and anew on another survey"
     if isinstance(mark, Duration):
         return "the survey's duration"
     return type(mark).__name__

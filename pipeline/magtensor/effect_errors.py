@@ -23,7 +23,7 @@ from magtensor.calibration.surveys.corrections import SurveysCalibration
 from magtensor.calibration.surveys.covariance import to_corrections, with_offset
 from magtensor.calibration.surveys.fit import frame_of
 from magtensor.calibration.types import Array, ArrayCalibration
-from magtensor.loop.beginnings import TONE
+from magtensor.loop.another_survey import TONE
 from magtensor.loop.columns import across_directions, along_the_field
 from magtensor.loop.model import Adopted, State
 from magtensor.loop.record import record_of

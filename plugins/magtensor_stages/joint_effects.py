@@ -99,7 +99,7 @@ def _records(surveys: Sequence[tuple[str, Survey]], uses: Sequence[np.ndarray], 
 
 
 def _require_sense(adopted: Sequence[Adopted], measured: bool, surveys: int) -> None:
-    from magtensor.loop.beginnings import TONE
+    from magtensor.loop.another_survey import TONE
 
     for one in adopted:
         if one.component.effect == "reference" and not measured:

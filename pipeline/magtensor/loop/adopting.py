@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from magtensor.loop.assessment import estimated, explained
+from magtensor.loop.beginnings import beginning, extent
 from magtensor.loop.contribution import KEEP_ALPHA, put_back, significance, slices
-from magtensor.loop.equilibrium import beginning, extent
 from magtensor.loop.gates import Candidate
 from magtensor.loop.model import Adopted, Fitting, Record, State, joint_state
 from magtensor.loop.profiling import golden

@@ -1,136 +1,79 @@
-"""What a survey began with and a calibration cannot know: the phase of a tone, the state of a response that lags.
-
-Both are found from the survey's own outputs, in what neither a uniform field nor a gradient can make of them, so that
-nothing a survey may be looking for is taken for an error of the instrument.
-"""
+"""Responses that lag and did not begin in equilibrium: with which lag and beginning they explain most."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from magtensor.calibration.by_sensor import by_sensor
-from magtensor.calibration.types import Array, ArrayCalibration
-from magtensor.loop.model import Adopted, Record
-from magtensor.loop.settings import Beginning, profiled
-from magtensor.tensor.geometry import array_design
-
-TONE = "periodic_interference"
-LEAST_CONTRAST = 1e-4  # of an effect's own power, between the sensors
-SIGNIFICANT = 4.0  # standard deviations of what a lagged response began with
-LEAST_PARTS = 8  # of the survey, whose means tell how large slow noise is
-
-
-def as_begun_here(
-    record: Record, calibration: ArrayCalibration, own: Sequence[tuple[Adopted, Array]]
-) -> list[tuple[Adopted, Array]]:
-    """Effects with their coefficients, as they are on a survey that began otherwise than the calibration's."""
-    begun = [(a, _tone_here(record, calibration, a, t) if a.name == TONE else t) for a, t in own]
-    for number, (model, theta) in enumerate(begun):
-        name = _unknown(model)
-        if name:
-            value = _state_here(record, calibration, begun, number, name)
-            begun[number] = replace(model, settings={**model.settings, name: value}), theta
-    return begun
+from magtensor.components import Component
+from magtensor.loop.assessment import WHITE, colours_of, estimated_in, likeliest
+from magtensor.loop.evidence import Whitened
+from magtensor.loop.excitation import Excitation
+from magtensor.loop.model import State, regressors
+from magtensor.loop.residual import Residual
+from magtensor.loop.scoring import Scorer
+from magtensor.loop.separation import SEPARATION
+from magtensor.loop.settings import AnyChannel, Beginning, Orders, profiled
+from magtensor.loop.terms import Terms, joined
 
 
-def _unknown(model: Adopted) -> str:
-    """The setting that says what a model began with, if that is not known; else ""."""
-    grids = profiled(model.component).items()
-    return next((n for n, g in grids if isinstance(g, Beginning) and np.isnan(model.settings.get(n, 0.0))), "")
+def beginning(model: Component, settings: Mapping[str, Any]) -> tuple[str, Beginning] | None:
+    """The setting that says what a model began with; None where it has none, or the lag is given."""
+    grids = profiled(model)
+    found = ((n, g) for n, g in grids.items() if isinstance(g, Beginning) and g.lag in grids)
+    return next(((n, g) for n, g in found if not settings.get(g.unless)), None)
 
 
-@dataclass(frozen=True)
-class _Contrast:
-    """What neither a uniform field nor a gradient can make of outputs; with fewer than four sensors and positions that
-    are not known, their differences."""
-
-    calibration: ArrayCalibration
-    free: Array
-    usable: NDArray[np.bool_]
-
-    @classmethod
-    def of(cls, record: Record, calibration: ArrayCalibration) -> _Contrast:
-        sensors = record.raw.shape[1]
-        held = np.tile(np.eye(3), (sensors, 1))
-        if record.position is not None and sensors > 3:
-            held = array_design(record.position, "gradient")
-        free = np.eye(3 * sensors) - held @ np.linalg.pinv(held, rcond=1e-9)
-        return cls(calibration, free, np.asarray(np.isfinite(record.raw).all(axis=(1, 2))))
-
-    def __call__(self, outputs: Array) -> Array:
-        """(n, 3 S) of outputs (N, S, 3), at the usable samples."""
-        b = by_sensor(self.calibration.matrix, outputs)[self.usable]
-        out: Array = b.reshape(len(b), -1) @ self.free
-        return out
+def extent(model: Component, settings: Mapping[str, Any], x: Excitation) -> float:
+    """The width of the channel that a model follows: what its response may be out of equilibrium by."""
+    channel, grid = next((n, g) for n, g in profiled(model).items() if isinstance(g, AnyChannel))
+    return float(np.ptp(x.channel(grid.pick(x, str(settings[channel]))), axis=0).max())
 
 
-def _tone_here(record: Record, calibration: ArrayCalibration, model: Adopted, theta: Array) -> Array:
-    """Coefficients of a tone with the phase and strength it has on this survey; what one survey began with is another's
-    accident.
+def begun(
+    model: Component, settings: dict[str, Any], state: State, few: tuple[Residual, Terms | None]
+) -> dict[str, Any]:
+    """Settings of a model with the lag and the beginning that explain most together, if the data separate them from
+    those given.
 
-    Found by least squares over the tone as it was and a quarter of a turn later, in what neither a uniform field nor a
-    gradient can make of the outputs (with fewer than four sensors: in their differences). A single sensor, and a tone
-    that all sensors see alike, leave it unknown, and nothing is taken off.
+    For each lag the coefficients of the channel and of what dies away are fitted freely; the beginning is the part of
+    the first that is in the second. Of powers of the channel the lowest alone is asked.
     """
-    contrast = _Contrast.of(record, calibration)
-    raw = np.where(contrast.usable[:, None, None], record.raw, 0.0)
-    terms = model.terms(record.excitation(raw, raw))
-    half = len(theta) // 2  # cosines first, then sines
-    later = np.concatenate([theta[half:], -theta[:half]])
-    size = raw[0].size
-    both = np.column_stack([contrast(terms.contribution(t, size).reshape(raw.shape)).ravel() for t in (theta, later)])
-    if np.sum(both**2) <= LEAST_CONTRAST * contrast.usable.sum() * float(theta @ theta):
-        return np.zeros_like(theta)
-    strengths = np.linalg.svd(both.T @ both, compute_uv=False)
-    if strengths[1] < LEAST_CONTRAST * strengths[0]:  # a tone that the sampling shows as a constant has no phase
-        return theta
-    own = np.linalg.lstsq(both, contrast(raw - calibration.offset).ravel(), rcond=1e-6)[0]
-    out: Array = own[0] * theta + own[1] * later
-    return out
+    found = beginning(model, settings)
+    if found is None:
+        return settings
+    name, mark = found
+    residual, given = few
+    x = state.excitation
+    widest = extent(model, settings, x)
 
+    def terms(changed: Mapping[str, Any]) -> Terms:
+        return regressors(model, x, changed).at(residual.samples)
 
-def shows_a_state(raw: Array, positions_known: bool) -> bool:
-    """Whether outputs (N, S, 3) can show what a lagged response began with, a gradient of the field apart."""
-    return positions_known and raw.shape[1] > 3
-
-
-def _state_here(
-    record: Record, calibration: ArrayCalibration, own: Sequence[tuple[Adopted, Array]], number: int, name: str
-) -> float:
-    """What the lagged response of one of the effects exceeded its channel's first reading by when the survey began.
-
-    It dies away with the lag, along vectors that are known: one number, found by least squares beside a constant, and 0
-    where slow noise could be it. With fewer than four sensors, or positions that are not known, nothing tells it from
-    a field that changes, and it is taken for 0.
-    """
-    if not shows_a_state(record.raw, record.position is not None):
-        return 0.0
-    contrast = _Contrast.of(record, calibration)
-    raw = np.where(contrast.usable[:, None, None], record.raw, 0.0)
-    b = calibration.apply(raw)
-    x = record.excitation(by_sensor(np.linalg.inv(calibration.matrix), b) + calibration.offset, b)
-
-    def added(effect: Adopted, theta: Array) -> Array:
-        return effect.terms(x).contribution(theta, raw[0].size).reshape(raw.shape)
-
-    model, theta = own[number]
-    unit = replace(model, settings={**model.settings, name: 1.0})
-    left = contrast(raw - calibration.offset - sum(added(*each) for each in own))
-    course = contrast(added(unit, theta) - added(model, theta))
-    if not contrast.usable.any() or float(np.sum(course**2)) <= 0.0:
-        return 0.0
-    left, course = left - left.mean(axis=0), course - course.mean(axis=0)
-    power = float(np.sum(course**2))
-    value = float(np.sum(course * left)) / power
-    # noise along the course's vectors, of its own colour: means over a lag tell more of it than single samples do
-    along = np.linalg.svd(course, full_matrices=False)[2][0]
-    noise = (left - value * course) @ along
-    grid = next(g for n, g in profiled(model.component).items() if n == name)
-    parts = max(int(np.ptp(record.time) / float(model.settings[grid.lag])), LEAST_PARTS)
-    means = np.array([part.mean() for part in np.array_split(noise, min(parts, len(noise)))])
-    variance = max(float(np.var(noise)), float(np.var(means)) * len(noise) / len(means))
-    return value if value**2 * power > SIGNIFICANT**2 * variance else 0.0
+    white = Whitened.of(residual, WHITE.across, WHITE.along, given, over_time=False)
+    score = Scorer(residual, given, WHITE)
+    grids = profiled(model)
+    orders = {n: min(g.options) for n, g in grids.items() if isinstance(g, Orders)}  # squares imitate what dies away
+    lags = {settings[mark.lag], *grids[mark.lag].values(x)}
+    tried = []
+    for lag in sorted(v for v in lags if v > 0):
+        at_rest = {**settings, **orders, mark.lag: lag, name: 0.0}
+        rest, moved = terms(at_rest), terms({**at_rest, name: widest})
+        dying = replace(moved, series=moved.series - rest.series)
+        estimate = estimated_in(white, joined([rest, dying]))
+        size = rest.count
+        own, its = estimate.theta[-2 * size : -size], estimate.theta[-size:]
+        weights = estimate.normal[-2 * size : -size, -2 * size : -size]
+        power = float(own @ weights @ own)
+        if power > 0:
+            value = widest * float(np.clip(own @ weights @ its / power, -1.0, 1.0))
+            tried.append({**at_rest, name: value})
+    if not tried:
+        return settings
+    best = max(tried, key=lambda each: score(terms(each)))
+    together = terms(best) if given is None else joined([given, terms(best)])
+    fair = Scorer(residual, given, likeliest(residual, together, [colours_of(residual), WHITE]).colours)
+    return best if fair(terms(best)) > fair(terms(settings)) + SEPARATION else settings

@@ -88,10 +88,10 @@ def agrees(state: State, place: int) -> bool:
     """Whether the coefficients of an adopted model are what its settings assume, and explain what they then must."""
     model = state.adopted[place]
     test = model.component.agrees
-    return test is None or test(model.settings, state.theta[place], explained(state, place))
+    return test is None or test(model.settings, state.theta[place], explained_share(state, place))
 
 
-def explained(state: State, place: int) -> float:
+def explained_share(state: State, place: int) -> float:
     """The share of |b| - F that an adopted model explains, of what lasts from one sample to the next: white noise, in
     which there is nothing to explain, has no part in it. 1 without a total field, or where nothing lasts."""
     assert state.terms is not None

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from magtensor.calibration.by_sensor import by_sensor
 from magtensor.calibration.types import Array, ArrayCalibration
-from magtensor.loop.beginnings import as_begun_here
+from magtensor.loop.another_survey import as_begun_here
 from magtensor.loop.model import Adopted, Record, State, without
 from magtensor.loop.waveform import NAME, course_of
 from magtensor.tensor.geometry import array_design

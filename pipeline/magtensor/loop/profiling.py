@@ -12,7 +12,7 @@ from magtensor.calibration.types import Array
 from magtensor.components import Component
 from magtensor.errors import UsageError
 from magtensor.loop.assessment import WHITE, colours_of, estimated, likeliest
-from magtensor.loop.equilibrium import begun
+from magtensor.loop.beginnings import begun
 from magtensor.loop.excitation import Excitation
 from magtensor.loop.model import State, regressors
 from magtensor.loop.multiplicity import alike, effective_tests, projected

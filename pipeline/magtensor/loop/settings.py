@@ -168,8 +168,8 @@ class Forms(Choice):
 class Beginning:
     """What a response that lags had from before the survey began, in the units of its channel.
 
-    The search takes it to begin in equilibrium; of an adopted model it is fitted where the data separate the two. It is
-    no part of the calibration: what another survey began with is found from its own outputs.
+    Settings are tried in equilibrium; with the lag that is best it is fitted where the data separate the two. It is no
+    part of the calibration: what another survey began with is found from its own outputs (`another_survey`).
 
     Attributes:
         lag, unless: the settings that are the lag, and that say of it that it is none.

@@ -12,7 +12,7 @@ import numpy as np
 
 from magtensor.calibration.types import Array, ArrayCalibration
 from magtensor.errors import DataError, UsageError
-from magtensor.loop.beginnings import TONE, shows_a_state
+from magtensor.loop.another_survey import TONE, shows_a_state
 from magtensor.loop.correction import corrected_raw, corrected_reference
 from magtensor.loop.model import Adopted, Record
 from magtensor.loop.needs import FACTS

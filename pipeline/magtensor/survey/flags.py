@@ -66,21 +66,26 @@ def flag_ranges(
 
 def summary(flags: Iterable[Flag]) -> list[str]:
     """One line for each pair of stage and reason: how many samples, of which sensors."""
-    groups: dict[tuple[str, str], list[Flag]] = {}
-    for flag in flags:
-        groups.setdefault((flag.by, flag.reason), []).append(flag)
-    lines = []
-    for (by, reason), members in groups.items():
-        sensors = sorted({m.sensor for m in members if m.sensor})
-        whose = f" of {', '.join(sensors)}" if sensors else ""
-        lines.append(f"{by}: {sum(m.samples for m in members)} samples{whose}: {reason}")
-    return lines
+    return [_line(group) for group in _groups(flags)]
 
 
 def much_lost(flags: Iterable[Flag], samples: int) -> list[str]:
-    """The lines of `summary` whose samples are more than a tenth of a survey's, each with how many these are."""
-    members: dict[tuple[str, str], list[Flag]] = {}
+    """The lines of `summary` that take more than a tenth of a survey's samples, each with how many these are."""
+    return [f"{_line(group)} (of {samples})" for group in _groups(flags) if _count(group) > MUCH * samples]
+
+
+def _groups(flags: Iterable[Flag]) -> list[list[Flag]]:
+    groups: dict[tuple[str, str], list[Flag]] = {}
     for flag in flags:
-        members.setdefault((flag.by, flag.reason), []).append(flag)
-    large = [group for group in members.values() if sum(f.samples for f in group) > MUCH * samples]
-    return [f"{line} (of {samples})" for group in large for line in summary(group)]
+        groups.setdefault((flag.by, flag.reason), []).append(flag)
+    return list(groups.values())
+
+
+def _count(group: list[Flag]) -> int:
+    return sum(flag.samples for flag in group)
+
+
+def _line(group: list[Flag]) -> str:
+    sensors = sorted({flag.sensor for flag in group if flag.sensor})
+    whose = f" of {', '.join(sensors)}" if sensors else ""
+    return f"{group[0].by}: {_count(group)} samples{whose}: {group[0].reason}"
