@@ -376,22 +376,9 @@ class Excitation:
 
 def _first_order(time: Array, series: Array, tau: float) -> Array:
     """Exact response of tau y' + y = x to x linear between samples, y starting at x[0]."""
-    from scipy.signal import lfilter
-
     if len(time) < 2:
         return series
     step = np.diff(time)
-    if np.ptp(step) < 1e-6 * step.mean():
-        decay = float(np.exp(-step.mean() / tau))
-        ramp = 1.0 - (1.0 - decay) * tau / step.mean()  # weight of the new sample beyond the old
-        hold = 1.0 - decay - ramp
-        lagged = np.concatenate([series[:1], series[:-1]])
-        driven = ramp * series + hold * lagged
-        driven[0] = 0.0
-        state = np.broadcast_to(series[0] * decay, (1, *series.shape[1:]))
-        tail = lfilter([1.0], [1.0, -decay], driven[1:], axis=0, zi=np.asarray(state, dtype=float))[0]
-        out: Array = np.concatenate([series[:1], tail])
-        return out
     decays: Array = np.exp(-step / tau)
     ramps: Array = 1.0 - (1.0 - decays) * tau / step
     shape = (-1, *[1] * (series.ndim - 1))
