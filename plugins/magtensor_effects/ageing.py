@@ -10,6 +10,7 @@ from magtensor.components import error_model
 from magtensor.loop.excitation import Excitation
 from magtensor.loop.settings import Duration, EventTimes, Orders, Range
 from magtensor.loop.terms import Terms, joined
+from magtensor_effects.forms import OfField
 
 Order = Annotated[int, Orders((1, 2, 3)), Field(ge=1, le=3, description="highest power of time")]
 Span = Annotated[
@@ -44,14 +45,14 @@ def offset_drift(x: Excitation, *, order: Order = 1, span_s: Span = 3600.0) -> T
     source="Yin and Luhr 2011 (CHAMP); Olsen et al. 2003 (Oersted)",
     typical="-79 ppm/yr (Swarm), as the logarithm of time (CHAMP) after launch",
 )
-def scale_drift(x: Excitation, *, order: Order = 1, span_s: Span = 3600.0) -> Terms:
+def scale_drift(x: Excitation, *, order: Order = 1, span_s: Span = 3600.0, of_field: OfField = False) -> Terms:
     """Each axis's scale factor drifts with time.
 
     Legendre polynomials of time over span_s times the axis's own output: the coefficient of P1 is half the change
     from the start to the end. Rivals: `reference_scale` where the total field changes steadily; `temperature_scale`.
     """
     named = enumerate(courses(x, order, span_s), start=1)
-    return joined([x.scales(1e-6 * c, "ppm", f"P{k} ") for k, c in named])
+    return joined([x.scales(1e-6 * c, "ppm", f"P{k} ", of_field=of_field) for k, c in named])
 
 
 @error_model("instrument", source="exponential settling", typical="a few nT over 15 min")
@@ -94,10 +95,10 @@ def offset_step(x: Excitation, *, time_s: EventTime = 0.0) -> Terms:
     typical="5 nT for 100 ppm: a range switched, a feedback resistor or reference voltage that has changed",
     pointwise=True,
 )
-def scale_step(x: Excitation, *, time_s: EventTime = 0.0) -> Terms:
+def scale_step(x: Excitation, *, time_s: EventTime = 0.0, of_field: OfField = False) -> Terms:
     """Each axis's scale factor jumps at a time: a range, a feedback resistor or a reference voltage changed.
 
     One coefficient an axis times its own output; several jumps are several models of this name. Rivals: `scale_drift`
     for a jump in the middle of a short survey, `offset_step` where the attitude hardly changes.
     """
-    return x.scales(np.where(x.elapsed >= time_s, 1e-6, 0.0), "ppm")
+    return x.scales(np.where(x.elapsed >= time_s, 1e-6, 0.0), "ppm", of_field=of_field)

@@ -5,35 +5,16 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field
 
-from magtensor.calibration.types import Array
 from magtensor.components import error_model
 from magtensor.loop.excitation import AXES, Excitation
-from magtensor.loop.settings import AnyChannel, Beginning, Choice, Forms, Frequencies, Range
+from magtensor.loop.settings import AnyChannel, Choice, Frequencies, Range
 from magtensor.loop.terms import Terms, joined
 from magtensor.units import convert
+from magtensor_effects.forms import AtStart, Delayed, OfField, Smooth
 
 ATTITUDE_ANGLES = ("roll*", "pitch*", "yaw*", "heading*", "azimuth*", "course*", "latitude*", "longitude*")
 ENCODER = AnyChannel("encoder*", without=ATTITUDE_ANGLES, or_units="rad", vectors=False)
 ANY = AnyChannel("*")
-Delayed = Annotated[
-    bool,
-    Forms((False, True)),
-    Field(description="true: later than the channel by lag_s, unchanged; false: behind it with a time constant lag_s"),
-]
-
-Smooth = Annotated[
-    bool,
-    Forms((False, True)),
-    Field(
-        description="true: without the noise of the channel's log, as far as its smooth course tells; false: as logged"
-    ),
-]
-
-AtStart = Annotated[
-    float,
-    Beginning(),
-    Field(description="by how much the lagged channel exceeded its first reading when the survey began"),
-]
 
 
 @error_model("instrument", needs=("encoder*",), source="rotating dipole", typical="100 nT for 1 A m2 at 1 m")
@@ -91,6 +72,7 @@ def channel_response(
         Choice((False, True)),
         Field(description="true: it changes the scale factors; false: it adds to the offsets"),
     ] = False,
+    of_field: OfField = False,
 ) -> Terms:
     """The output follows a power of any logged channel, through a lag, as an offset or as a factor.
 
@@ -101,12 +83,7 @@ def channel_response(
     name = ANY.pick(x, channel)
     course = x.channel(name, lag_s, delayed, smooth, at_start) ** power
     per_unit = f"({x.units[name]})^{power}" if power > 1 else x.units[name]
-    if not x.is_vector(name):
-        return x.scales(1e-6 * course, f"ppm/{per_unit}") if times_field else x.offsets(course, f"nT/{per_unit}")
-    if times_field:
-        return joined([x.scales(1e-6 * c, f"ppm/{per_unit}", f"{AXES[i]} ") for i, c in enumerate(_columns(course))])
-    return x.matrices(course, f"nT/{per_unit}")
-
-
-def _columns(values: Array) -> list[Array]:
-    return [values[:, i] for i in range(values.shape[1])]
+    if not times_field:
+        return x.matrices(course, f"nT/{per_unit}") if x.is_vector(name) else x.offsets(course, f"nT/{per_unit}")
+    columns = [(f"{AXES[i]} ", c) for i, c in enumerate(course.T)] if x.is_vector(name) else [("", course)]
+    return joined([x.scales(1e-6 * c, f"ppm/{per_unit}", label, of_field=of_field) for label, c in columns])

@@ -8,7 +8,7 @@ from magtensor.components import error_model
 from magtensor.loop.excitation import Excitation
 from magtensor.loop.settings import AnyChannel, Range
 from magtensor.loop.terms import Terms
-from magtensor_effects.channels import Delayed, Smooth
+from magtensor_effects.forms import Delayed, OfField, Smooth
 
 CURRENT = AnyChannel("current_*", or_units="A", vectors=False)
 SUPPLY = AnyChannel("supply*", or_units="V", vectors=False)
@@ -45,14 +45,14 @@ def current_field(
 
 
 @error_model("instrument", needs=("supply*",), source="dependence of the excitation on the supply", typical="10 ppm/V")
-def supply_scale(x: Excitation, *, channel: Supply = "", smooth: Smooth = False) -> Terms:
+def supply_scale(x: Excitation, *, channel: Supply = "", smooth: Smooth = False, of_field: OfField = False) -> Terms:
     """Each axis's scale factor follows the supply voltage.
 
     The voltage times the axis's own output. Rivals: `supply_offset` where the attitude hardly changes;
     `scale_drift` for a battery that discharges steadily.
     """
     name = SUPPLY.pick(x, channel)
-    return x.scales(1e-6 * x.channel(name, smooth=smooth), f"ppm/{x.units[name]}")
+    return x.scales(1e-6 * x.channel(name, smooth=smooth), f"ppm/{x.units[name]}", of_field=of_field)
 
 
 @error_model("instrument", needs=("supply*",), source="dependence of the electronics on the supply", typical="a nT/V")

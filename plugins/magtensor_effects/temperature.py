@@ -8,7 +8,7 @@ from magtensor.components import error_model
 from magtensor.loop.excitation import Excitation
 from magtensor.loop.settings import AnyChannel, Orders, Range
 from magtensor.loop.terms import Terms, joined
-from magtensor_effects.channels import AtStart, Delayed
+from magtensor_effects.forms import AtStart, Delayed, OfField
 
 THERMOMETER = AnyChannel("temperature*", or_units="degC", vectors=False)
 
@@ -18,7 +18,7 @@ Thermometer = Annotated[
 Order = Annotated[int, Orders((1, 2)), Field(ge=1, le=2, description="highest power of the temperature")]
 ThermalLag = Annotated[
     float,
-    Range(0.0, 600.0, count=8, spacing="log"),
+    Range(0.0, 3600.0, count=11, spacing="log"),
     Field(ge=0, description="how far the sensor is behind the thermometer, s"),
 ]
 
@@ -66,6 +66,7 @@ def temperature_scale(
     lag_s: ThermalLag = 0.0,
     delayed: Delayed = False,
     at_start: AtStart = 0.0,
+    of_field: OfField = False,
 ) -> Terms:
     """Each axis's scale factor follows the temperature of the sensor, which lags the thermometer.
 
@@ -75,7 +76,7 @@ def temperature_scale(
     name = THERMOMETER.pick(x, channel)
     course = x.thermometer(name, lag_s, delayed, at_start)
     powers = _powers(x.units[name], order)
-    return joined([x.scales(1e-6 * course**k, f"ppm/{units}", label) for k, units, label in powers])
+    return joined([x.scales(1e-6 * course**k, f"ppm/{units}", label, of_field=of_field) for k, units, label in powers])
 
 
 @error_model(

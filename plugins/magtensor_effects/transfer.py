@@ -10,6 +10,7 @@ from magtensor.components import error_model
 from magtensor.loop.excitation import Excitation
 from magtensor.loop.settings import Range
 from magtensor.loop.terms import Terms, joined
+from magtensor_effects.forms import OfField
 
 FULL_SCALE_NT = 50000.0  # at which the coefficients of nonlinear terms are stated
 AT_FULL_SCALE = "nT at 50000 nT"
@@ -28,14 +29,14 @@ def nonlinearity_quadratic(x: Excitation) -> Terms:
 
 
 @error_model("instrument", source="Olsen et al. 2020 (CryoSat-2)", typical="1 nT at 50 000 nT")
-def nonlinearity_cubic(x: Excitation) -> Terms:
+def nonlinearity_cubic(x: Excitation, *, of_field: OfField = False) -> Terms:
     """A third-order term in each axis's transfer curve: (m / 50 000 nT) cubed.
 
     The coefficient is what it adds at 50 000 nT. In a constant total field F an answer m (F^2 - m^2) to the field
     across the axis is the same thing with the other sign but for a scale factor; no survey in the Earth's field
     alone tells the two apart, and this name stands for both.
     """
-    return x.responses((x.output / FULL_SCALE_NT) ** 3, AT_FULL_SCALE)
+    return x.responses((x.driving(of_field) / FULL_SCALE_NT) ** 3, AT_FULL_SCALE)
 
 
 @error_model(

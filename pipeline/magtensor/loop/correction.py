@@ -54,7 +54,7 @@ def corrected_raw(
     for _ in range(MOST_STEPS):
         b = calibration.apply(raw)
         output = by_sensor(forward, b) + calibration.offset
-        x = record.excitation(_whole(output), _whole(b))
+        x = record.excitation(_whole(output), _whole(b), matrix=np.asarray(forward, dtype=float))
         after = record.raw
         for model, coefficients in own:
             after = after - model.terms(x).contribution(coefficients, raw.shape[1] * 3).reshape(raw.shape)

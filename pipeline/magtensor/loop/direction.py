@@ -37,6 +37,15 @@ def attitude_series(x: Excitation) -> Array:
     return np.column_stack(columns)
 
 
+def turning_Hz(x: Excitation) -> float:
+    """How often the platform turns in a second, rms; without attitude only the turning of the field tells."""
+    axes = [_unit(x.field[:, 0])]
+    if x.attitude is not None:
+        axes = [into_platform(x.attitude, axis) for axis in np.eye(3)]
+    squares = sum(np.mean(np.sum(x.derivative(axis) ** 2, axis=1)) for axis in axes)
+    return float(np.sqrt(squares / (2.0 if len(axes) == 3 else 1.0)) / (2.0 * np.pi))  # three axes show a turn twice
+
+
 def _unit(vectors: Array) -> Array:
     out: Array = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
     return out

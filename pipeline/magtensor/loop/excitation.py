@@ -316,10 +316,17 @@ class Excitation:
         outputs = np.arange(3 * len(self.sensors))
         return self._single(columns, outputs, np.zeros_like(outputs) if shared else outputs // 3, units, name)
 
-    def scales(self, series: Array, units: str, name: str = "") -> Terms:
-        """A series (N,) or (N, S) times the axis's own output: one coefficient an axis."""
+    def driving(self, of_field: bool) -> Array:
+        """(N, S, 3) nT: the outputs, or what is in them of the field, without the offsets.
+
+        A feedback resistor that warms scales the field and the hard iron; the offset of the electronics comes after it.
+        """
+        return self.sensed(self.field) if of_field else self.output
+
+    def scales(self, series: Array, units: str, name: str = "", *, of_field: bool = False) -> Terms:
+        """A series (N,) or (N, S) times the axis's own output, or the field in it: one coefficient an axis."""
         factor = np.asarray(series, dtype=float).reshape(len(self.time), -1, 1)
-        return self.responses(self.output * factor, units, name)
+        return self.responses(self.driving(of_field) * factor, units, name)
 
     def responses(self, series: Array, units: str, name: str = "") -> Terms:
         """A series for each axis of each sensor, (N, S, 3): one coefficient an axis."""

@@ -88,13 +88,23 @@ class Record:
             courses={},
         )
 
-    def excitation(self, output: Array, field_: Array, lines: Sequence[float] = ()) -> Excitation:
-        """What error models see, given the modelled outputs and fields (N, S, 3)."""
-        return Excitation(
+    def excitation(
+        self, output: Array, field_: Array, lines: Sequence[float] = (), *, matrix: Array | None = None
+    ) -> Excitation:
+        """What error models see, given the modelled outputs and fields (N, S, 3).
+
+        Parameters
+        ----------
+        matrix: (S, 3, 3) C by which outputs follow from fields; None where the two have to tell.
+        """
+        x = Excitation(
             self.time, self.start, self.sensors, output, field_, self.quiet_field, self.logged, self.units, self.run,
             self.segment, self.position, self.attitude, tuple(lines), self.waveform, station=self.station,
             courses=self.courses,
         )  # fmt: skip
+        if matrix is not None:
+            vars(x)["matrix"] = matrix
+        return x
 
 
 def regressors(component: Component, x: Excitation, settings: Mapping[str, Any]) -> Terms:
@@ -358,7 +368,7 @@ def excitation_of(record: Record, fit: JointFit, lines: Sequence[float] = ()) ->
     b = fit.scalar.field(fit.plane.coordinates(record.raw)) if fit.posterior is None else fit.posterior.field
     output = by_sensor(fit.forward, b) + fit.offset
     common = np.repeat((b @ q)[:, None], len(record.sensors), axis=1)
-    return record.excitation(output, common, lines)
+    return record.excitation(output, common, lines, matrix=fit.forward @ q)
 
 
 Progress = Callable[[str], None]

@@ -4,8 +4,9 @@ Any law of the attitude resembles any other one a little. Where something large 
 (a gradient of the site, and no attitude logged to know it by), a named law that is a small part of it is significant,
 predicts held-out blocks, and is wrong elsewhere: of the five components of a gradient one looks exactly like a
 quadratic nonlinearity. So an adopted effect that follows the attitude and explains less than what stays unexplained is
-taken out again; and so is what happened once, where the sensors share a waveform that has no name and is larger, or
-switches along the same vectors: a step or a passage may be a part of it.
+taken out again. So is a tone
+that may be a harmonic of how the platform turns; and what happened once, where the sensors share a waveform that has no
+name and is larger, or switches along the same vectors: a step or a passage may be a part of it.
 """
 
 from __future__ import annotations
@@ -17,11 +18,11 @@ import numpy as np
 from magtensor.calibration.types import Array
 from magtensor.loop.assessment import estimated
 from magtensor.loop.contribution import removal, slices
-from magtensor.loop.direction import attitude_series
+from magtensor.loop.direction import attitude_series, turning_Hz
 from magtensor.loop.found import Search
-from magtensor.loop.model import State
+from magtensor.loop.model import Adopted, State
 from magtensor.loop.residual import taken_off
-from magtensor.loop.settings import EventTimes, profiled
+from magtensor.loop.settings import EventTimes, Frequencies, profiled
 from magtensor.loop.terms import joined
 from magtensor.loop.unexplained import unexplained
 from magtensor.loop.waveform import NAME
@@ -29,23 +30,49 @@ from magtensor.loop.waveform import NAME
 MOSTLY = 0.5  # of what an effect adds: so much of it, predicted from the attitude, follows the attitude
 
 
-def overshadowed(found: Search, fixed: int) -> tuple[str, str] | None:
-    """The weakest effect that follows the attitude and explains less than what stays, and why it is doubted."""
+HARMONICS = 8  # of the platform's turning that a law of the attitude with a corner has
+
+
+def overshadowed(found: Search, fixed: int) -> tuple[list[int], str] | None:
+    """The weakest effect that follows the attitude and explains less than what stays, by its places among what is
+    adopted, and why it is doubted."""
     state, left = found.last, staying(found)
-    weakest: tuple[float, str] | None = None
-    for name in dict.fromkeys(a.name for a in state.adopted[fixed:]):
-        places = [i for i, a in enumerate(state.adopted) if a.name == name and i >= fixed]
+    weakest: tuple[float, list[int], str] | None = None
+    for places in _of_one_name(state, fixed):
         before, after = removal(state, *places)
         amount = float(np.sqrt(max(before**2 - after**2, 0.0)))
-        if amount < left and (weakest is None or amount < weakest[0]) and attitude_share(state, places) > MOSTLY:
-            weakest = amount, name
+        if amount < left and (weakest is None or amount < weakest[0]) and (why := _of_the_attitude(state, places)):
+            weakest = amount, places, why
     if weakest is None or not unexplained(found, found.record)["present"]:
         return _part_of_a_source(found, fixed)
-    amount, name = weakest
-    return name, f"it follows the attitude and explains {amount:.3g} nT rms, less than the {left:.3g} nT that stay"
+    amount, places, why = weakest
+    return places, f"it {why} and explains {amount:.3g} nT rms, less than the {left:.3g} nT that stay"
 
 
-def _part_of_a_source(found: Search, fixed: int) -> tuple[str, str] | None:
+def _of_one_name(state: State, fixed: int) -> list[list[int]]:
+    """The places of the adopted models, those of one name together, but each tone by itself."""
+    named: dict[str, list[int]] = {}
+    for place, model in enumerate(state.adopted[fixed:], start=fixed):
+        named.setdefault(f"{model.name} {place}" if _frequency(model) else model.name, []).append(place)
+    return list(named.values())
+
+
+def _frequency(model: Adopted) -> float:
+    """Hz, of a tone; else 0."""
+    marks = profiled(model.component).items()
+    return next((float(model.settings[name]) for name, mark in marks if isinstance(mark, Frequencies)), 0.0)
+
+
+def _of_the_attitude(state: State, places: Sequence[int]) -> str:
+    """In which way adopted models may be a part of a law of the attitude; "" if in none."""
+    frequency = _frequency(state.adopted[places[0]])
+    turning = turning_Hz(state.excitation)
+    if 0 < frequency < HARMONICS * turning:
+        return f"may be a harmonic of the platform's turning ({turning:.3g} Hz)"
+    return "follows the attitude" if attitude_share(state, places) > MOSTLY else ""
+
+
+def _part_of_a_source(found: Search, fixed: int) -> tuple[list[int], str] | None:
     """An effect that happened once beside a waveform of no name that is larger, or of which it may be one switching
     among several, and why it is doubted."""
     shared, state = found.shared, found.last
@@ -64,7 +91,8 @@ def _part_of_a_source(found: Search, fixed: int) -> tuple[str, str] | None:
         own = float(np.sqrt(np.mean(state.terms.contribution(theta, shared.direction.size) ** 2)))
         if own < amount or (shared.switches and shared.left_by == model.name):
             shared_by = f"the waveform that the sensors share ({amount:.3g} nT)"
-            return model.name, f"it explains {own:.3g} nT rms and may be a part of {shared_by}"
+            places = [i for i, a in enumerate(state.adopted) if a.name == model.name and i >= fixed]
+            return places, f"it explains {own:.3g} nT rms and may be a part of {shared_by}"
     return None
 
 

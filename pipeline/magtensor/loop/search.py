@@ -113,10 +113,10 @@ def search(
     found = Search(first, _settled(record, state, how), tuple(steps), not_tested, failed, record, shared)
     found = replace(found, shared=shared or sought(found.last, record))
     while doubted := overshadowed(found, len(declared)):
-        name, why = doubted
+        places, why = doubted
+        name = found.last.adopted[places[0]].name
         if say is not None:
             say(f"taking {name} out again")
-        places = [i for i, a in enumerate(found.last.adopted) if a.name == name and i >= len(declared)]
         record, state = renewed(record, without_models(record, found.last, places, how), how)
         state = with_lines(state, record, lines)
         candidates = candidates_of(state, open_models(testable, state), failed, alpha)

@@ -217,9 +217,7 @@ def _excitation(of: Together, samples: Samples, fit: SurveysFit, survey: int) ->
     b = y @ fit.found.matrix.T
     output = by_sensor(fit.forward, b) + offset
     common = np.repeat((factor * b @ turn)[:, None], len(forward), axis=1)
-    x = of.records[survey].excitation(output, common)
-    vars(x)["matrix"] = forward / factor  # that of all surveys
-    return x
+    return of.records[survey].excitation(output, common, matrix=forward / factor)
 
 
 def _without(samples: Samples, terms: Terms, theta: Array) -> Samples:

@@ -1,0 +1,33 @@
+"""Settings that give a response another form, alike in what it explains."""
+
+from typing import Annotated
+
+from pydantic import Field
+
+from magtensor.loop.settings import Beginning, Forms
+
+Delayed = Annotated[
+    bool,
+    Forms((False, True)),
+    Field(description="true: later than the channel by lag_s, unchanged; false: behind it with a time constant lag_s"),
+]
+
+Smooth = Annotated[
+    bool,
+    Forms((False, True)),
+    Field(
+        description="true: without the noise of the channel's log, as far as its smooth course tells; false: as logged"
+    ),
+]
+
+AtStart = Annotated[
+    float,
+    Beginning(),
+    Field(description="by how much the lagged channel exceeded its first reading when the survey began"),
+]
+
+OfField = Annotated[
+    bool,
+    Forms((False, True)),
+    Field(description="true: acts on what the axis makes of the field; false: on its whole output, offset and all"),
+]
