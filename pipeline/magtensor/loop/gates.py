@@ -19,7 +19,8 @@ UNLIKELY = 0.02  # of the family-wise probability: asked for in noise of the res
 SECOND_ORDER = 1e-5  # of the sum of squares that is explained: 0.3 % of an effect's size
 OF_THE_LAW = 0.0025  # the same, that the law of an effect may miss: 5 % of its size
 LEAST_REDUCTION = 1e-4  # of the held-out sum of squares: smaller is significant only in very long surveys
-LOG_MARGIN = 1.5  # the noise of a log is known to some per cent, and a dozen coefficients gain a little by chance
+LOG_MARGIN = 1.5  # the noise of a log is known to some per cent
+LOG_DEVIATIONS = 3.0  # of what coefficients gain of it by chance
 
 
 @dataclass(frozen=True)
@@ -51,7 +52,7 @@ class Candidate:
     @property
     def of_the_log(self) -> bool:
         """Whether noise in the log of a channel explains what it gains."""
-        return 0.0 < self.assessment.gain.total <= LOG_MARGIN * self.log_noise
+        return 0.0 < self.assessment.gain.total <= gained_of_a_log(self.log_noise, self.assessment.estimate.rank)
 
     @property
     def of_second_order(self) -> bool:
@@ -115,6 +116,17 @@ class Candidate:
     def passes(self) -> bool:
         """Both gates."""
         return self.predicts and self.beyond_slow_noise
+
+
+def gained_of_a_log(log_noise: float, coefficients: float) -> float:
+    """The most that coefficients gain of noise in the log of a channel, whose sum of squares is given; 0 of none.
+
+    Beside the noise of the sensors that is a chi-square with so many degrees of freedom whose noncentrality is the sum.
+    """
+    if log_noise <= 0:
+        return 0.0
+    scatter = LOG_DEVIATIONS * float(np.sqrt(2.0 * coefficients + 4.0 * log_noise))
+    return max(LOG_MARGIN * log_noise, log_noise + coefficients + scatter)
 
 
 def explained_before(state: State) -> float:
