@@ -30,7 +30,7 @@ from magtensor.loop.waveform import NAME
 MOSTLY = 0.5  # of what an effect adds: so much of it, predicted from the attitude, follows the attitude
 
 
-HARMONICS = 8  # of the platform's turning that a law of the attitude with a corner has
+HARMONICS = 16  # of the turning, that a law of the attitude with a corner shows
 
 
 def overshadowed(found: Search, fixed: int) -> tuple[list[int], str] | None:
