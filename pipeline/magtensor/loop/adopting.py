@@ -12,8 +12,8 @@ from magtensor.loop.assessment import estimated, explained
 from magtensor.loop.beginnings import beginning, extent
 from magtensor.loop.contribution import KEEP_ALPHA, put_back, significance, slices
 from magtensor.loop.gates import Candidate
+from magtensor.loop.golden import golden
 from magtensor.loop.model import Adopted, Fitting, Record, State, joint_state
-from magtensor.loop.profiling import golden
 from magtensor.loop.scoring import Scorer
 from magtensor.loop.separation import SEPARATION
 from magtensor.loop.settings import Forms, Frequencies, Range, profiled

@@ -12,6 +12,7 @@ from magtensor.components import Component
 from magtensor.loop.assessment import WHITE, colours_of, estimated_in, likeliest
 from magtensor.loop.evidence import Whitened
 from magtensor.loop.excitation import Excitation
+from magtensor.loop.golden import golden
 from magtensor.loop.model import State, regressors
 from magtensor.loop.residual import Residual
 from magtensor.loop.scoring import Scorer
@@ -57,9 +58,8 @@ def begun(
     score = Scorer(residual, given, WHITE)
     grids = profiled(model)
     orders = {n: min(g.options) for n, g in grids.items() if isinstance(g, Orders)}  # squares imitate what dies away
-    lags = {settings[mark.lag], *grids[mark.lag].values(x)}
-    tried = []
-    for lag in sorted(v for v in lags if v > 0):
+
+    def with_lag(lag: float) -> dict[str, Any] | None:
         at_rest = {**settings, **orders, mark.lag: lag, name: 0.0}
         rest, moved = terms(at_rest), terms({**at_rest, name: widest})
         dying = replace(moved, series=moved.series - rest.series)
@@ -68,12 +68,22 @@ def begun(
         own, its = estimate.theta[-2 * size : -size], estimate.theta[-size:]
         weights = estimate.normal[-2 * size : -size, -2 * size : -size]
         power = float(own @ weights @ own)
-        if power > 0:
-            value = widest * float(np.clip(own @ weights @ its / power, -1.0, 1.0))
-            tried.append({**at_rest, name: value})
-    if not tried:
+        if not power > 0:
+            return None
+        return {**at_rest, name: widest * float(np.clip(own @ weights @ its / power, -1.0, 1.0))}
+
+    def gain(lag: float) -> float:
+        found = with_lag(lag)
+        return -np.inf if found is None else score(terms(found))
+
+    lags = sorted(v for v in {settings[mark.lag], *grids[mark.lag].values(x)} if v > 0)
+    nearest = max(range(len(lags)), key=lambda i: gain(lags[i]))
+    best = with_lag(lags[nearest])
+    if best is None:
         return settings
-    best = max(tried, key=lambda each: score(terms(each)))
     together = terms(best) if given is None else joined([given, terms(best)])
     fair = Scorer(residual, given, likeliest(residual, together, [colours_of(residual), WHITE]).colours)
-    return best if fair(terms(best)) > fair(terms(settings)) + SEPARATION else settings
+    if fair(terms(best)) <= fair(terms(settings)) + SEPARATION:
+        return settings
+    low, high = lags[max(nearest - 1, 0)], lags[min(nearest + 1, len(lags) - 1)]
+    return with_lag(golden(gain, low, high, lags[nearest])) or best

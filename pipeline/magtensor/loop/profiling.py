@@ -14,6 +14,7 @@ from magtensor.errors import UsageError
 from magtensor.loop.assessment import WHITE, colours_of, estimated, likeliest
 from magtensor.loop.beginnings import begun
 from magtensor.loop.excitation import Excitation
+from magtensor.loop.golden import REFINEMENTS, golden
 from magtensor.loop.model import State, regressors
 from magtensor.loop.multiplicity import alike, effective_tests, projected
 from magtensor.loop.residual import Residual
@@ -27,7 +28,6 @@ SCREENING_SAMPLES = 2000  # settings are profiled on so many samples
 REFINING_SAMPLES = 6000  # and the best of them refined on so many
 BATCH_ENTRIES = 130_000  # numbers in the series that are worked on together
 MOST_OF_IT = 0.75  # of what a model explains, if it is to be made about other settings
-_REFINEMENTS = 8
 _OF_A_LINE = 16  # to a thousandth of its width
 _GOLDEN = 0.4812  # log of what a step of a golden section divides by
 _SAMPLES_ABOUT = 6  # to either side of an event's time in white noise
@@ -206,7 +206,7 @@ def refined(model: Component, settings: dict[str, Any], state: State, failed: di
         if isinstance(grid, EventTimes):
             best = _its_time(gain, Scorer(residual, given, WHITE), at, (low, high), best, state.excitation.spacing)
         else:
-            best = golden(gain, low, high, best, _OF_A_LINE if isinstance(grid, Frequencies) else _REFINEMENTS)
+            best = golden(gain, low, high, best, _OF_A_LINE if isinstance(grid, Frequencies) else REFINEMENTS)
         if low <= 0.0 <= high and _of_ratios(grid) and gain(best) - gain(0.0) < SEPARATION / 2.0:
             best = 0.0
         settings = {**settings, name: best}
@@ -233,7 +233,7 @@ def _its_time(
         found = at(value)
         return -np.inf if found is None else white(found)
 
-    steps = int(np.clip(np.ceil(np.log(max((high - low) / spacing, 2.0)) / _GOLDEN), _REFINEMENTS, _OF_A_LINE))
+    steps = int(np.clip(np.ceil(np.log(max((high - low) / spacing, 2.0)) / _GOLDEN), REFINEMENTS, _OF_A_LINE))
     about = golden(in_white, low, high, best, steps)
     near = about + spacing * np.arange(-_SAMPLES_ABOUT, _SAMPLES_ABOUT + 1)
     from_afar = golden(gain, low, high, best)
@@ -269,7 +269,7 @@ def _about_what_it_fits(
     assert model.about is not None
     moved = settings
     last = np.inf
-    for _ in range(_REFINEMENTS):
+    for _ in range(REFINEMENTS):
         if terms is None:
             return settings
         together = terms if given is None else joined([given, terms])
@@ -283,22 +283,3 @@ def _about_what_it_fits(
         last = step
         terms = at(moved)
     return moved if first is not None and terms is not None and score(terms) >= MOST_OF_IT * score(first) else settings
-
-
-def golden(f: Callable[[float], float], low: float, high: float, best: float, steps: int = _REFINEMENTS) -> float:
-    """Where f is largest between two limits, by golden section; `best` if nothing exceeds f there."""
-    ratio = (np.sqrt(5.0) - 1) / 2
-    a, b = low, high
-    c, d = b - ratio * (b - a), a + ratio * (b - a)
-    fc, fd, known = f(c), f(d), f(best)
-    for _ in range(steps):
-        if fc > fd:
-            b, d, fd = d, c, fc
-            c = b - ratio * (b - a)
-            fc = f(c)
-        else:
-            a, c, fc = c, d, fd
-            d = a + ratio * (b - a)
-            fd = f(d)
-    value, top = (c, fc) if fc > fd else (d, fd)
-    return float(value) if top > known else best
