@@ -1,4 +1,4 @@
-"""Settings that give a response another form, alike in what it explains."""
+"""Settings that several error models share: forms of a response, and what it began with."""
 
 from typing import Annotated
 

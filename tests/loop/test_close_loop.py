@@ -205,7 +205,7 @@ def test_a_jump_lasts_into_later_surveys(effect: str, tmp_path: Path) -> None:
             new[name] = item[keep] if item.shape[:1] == keep.shape else item[()]
             if "units" in item.attrs:
                 new[name].attrs["units"] = item.attrs["units"]
-    found = magtensor.close_loop(whole, search=[effect])
+    found = magtensor.close_loop(whole, search=list(JUMPS))
     assert [(a["error_model"], a["sensors"]) for a in found.verdict["adopted"]] == [(effect, ["S2"])]
     b = found.calibration.apply(later)["calibrated/b"].values
     contrast = b - b.mean(axis=1, keepdims=True)

@@ -112,7 +112,8 @@ def _state_here(
     contrast = _Contrast.of(record, calibration)
     raw = np.where(contrast.usable[:, None, None], record.raw, 0.0)
     b = calibration.apply(raw)
-    x = record.excitation(by_sensor(np.linalg.inv(calibration.matrix), b) + calibration.offset, b)
+    forward = np.asarray(np.linalg.inv(calibration.matrix), dtype=float)
+    x = record.excitation(by_sensor(forward, b) + calibration.offset, b, matrix=forward)
 
     def added(effect: Adopted, theta: Array) -> Array:
         return effect.terms(x).contribution(theta, raw[0].size).reshape(raw.shape)

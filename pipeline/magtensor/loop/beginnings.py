@@ -77,9 +77,9 @@ def begun(
         return -np.inf if found is None else score(terms(found))
 
     lags = sorted(v for v in {settings[mark.lag], *grids[mark.lag].values(x)} if v > 0)
-    nearest = max(range(len(lags)), key=lambda i: gain(lags[i]))
-    best = with_lag(lags[nearest])
-    if best is None:
+    nearest = max(range(len(lags)), key=lambda i: gain(lags[i]), default=None)
+    best = None if nearest is None else with_lag(lags[nearest])
+    if nearest is None or best is None:
         return settings
     together = terms(best) if given is None else joined([given, terms(best)])
     fair = Scorer(residual, given, likeliest(residual, together, [colours_of(residual), WHITE]).colours)

@@ -22,7 +22,7 @@ from magtensor.loop.assessment import Assessment, estimated
 from magtensor.loop.colour import beside_the_field
 from magtensor.loop.direction import attitude_series
 from magtensor.loop.factor import Factors, Groups, noise_alone, with_factor
-from magtensor.loop.gates import LOG_MARGIN, OF_THE_LAW, Candidate, explained_before
+from magtensor.loop.gates import OF_THE_LAW, Candidate, explained_before, gained_of_a_log
 from magtensor.loop.likeness import effect_along, followed
 from magtensor.loop.log_noise import brought_in
 from magtensor.loop.model import Adopted, Fitting, Record, State, excitation_of, joint_state, without
@@ -131,7 +131,7 @@ def sought(state: State, record: Record) -> Sought | None:
         gain=gain,
         like=like,
         switches=course.switches,
-        of_the_log=gain.total <= LOG_MARGIN * _of_the_logs(state),
+        of_the_log=gain.total <= gained_of_a_log(_of_the_logs(state), len(seen)),
         objection=objection,
         left_by=left_by,
     )

@@ -4,9 +4,9 @@ Any law of the attitude resembles any other one a little. Where something large 
 (a gradient of the site, and no attitude logged to know it by), a named law that is a small part of it is significant,
 predicts held-out blocks, and is wrong elsewhere: of the five components of a gradient one looks exactly like a
 quadratic nonlinearity. So an adopted effect that follows the attitude and explains less than what stays unexplained is
-taken out again. So is a tone
-that may be a harmonic of how the platform turns; and what happened once, where the sensors share a waveform that has no
-name and is larger, or switches along the same vectors: a step or a passage may be a part of it.
+taken out again. So is a tone that may be a harmonic of how the platform turns; and so is what happened once, where the
+sensors share a waveform that has no name and is larger, or switches along the same vectors: a step or a passage may be
+a part of it.
 """
 
 from __future__ import annotations
@@ -28,8 +28,6 @@ from magtensor.loop.unexplained import unexplained
 from magtensor.loop.waveform import NAME
 
 MOSTLY = 0.5  # of what an effect adds: so much of it, predicted from the attitude, follows the attitude
-
-
 HARMONICS = 16  # of the turning, that a law of the attitude with a corner shows
 
 
@@ -66,8 +64,7 @@ def _frequency(model: Adopted) -> float:
 def _of_the_attitude(state: State, places: Sequence[int]) -> str:
     """In which way adopted models may be a part of a law of the attitude; "" if in none."""
     frequency = _frequency(state.adopted[places[0]])
-    turning = turning_Hz(state.excitation)
-    if 0 < frequency < HARMONICS * turning:
+    if frequency and frequency < HARMONICS * (turning := turning_Hz(state.excitation)):
         return f"may be a harmonic of the platform's turning ({turning:.3g} Hz)"
     return "follows the attitude" if attitude_share(state, places) > MOSTLY else ""
 
