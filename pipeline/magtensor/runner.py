@@ -145,16 +145,23 @@ def told_of_reading(survey: Survey) -> list[str]:
     ]
 
 
+NO_REFERENCE = (
+    "no base station? `survey: {reference: {constant: {value: ..., units: nT, why: ...}}}` takes the total field as "
+    "constant; `file:` and `total_field:` there take it from another file (docs/surveys.md)"
+)
+
+
 def _require(stage: PlannedStage, survey: Survey) -> None:
     """The plan knew only what a loader may give; now the data are there."""
     for need in stage.declares.needs:
         if not any(fnmatchcase(path, need) for path in survey.paths()):
             from magtensor.errors import DataError
 
+            has = f"it has {', '.join(p for p in survey.paths() if '/' not in p or p.startswith('reference/'))}"
             raise DataError(
                 f"stage {stage.name} needs {need}, which this survey does not have",
                 where=str(survey.attributes.get("source", "")),
-                hint=f"it has {', '.join(p for p in survey.paths() if '/' not in p or p.startswith('reference/'))}",
+                hint=f"{has}\n  {NO_REFERENCE}" if need.startswith("reference/") else has,
             )
 
 

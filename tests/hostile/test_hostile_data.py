@@ -61,7 +61,7 @@ def no_position(c: Contents) -> None:
     c.drop("position")
 
 
-@damage("needs reference/time")
+@damage("needs reference/time", r"reference: \{constant:")
 def no_reference(c: Contents) -> None:
     c.drop("reference/time", "reference/total_field")
 
