@@ -2,12 +2,21 @@
 
 from typing import Annotated
 
+import numpy as np
 from pydantic import Field
 
 from magtensor.components import error_model
 from magtensor.loop.excitation import Excitation
-from magtensor.loop.settings import Choice, Range
+from magtensor.loop.settings import Beginning, Choice, Range
 from magtensor.loop.terms import Terms
+
+FieldAtStart = Annotated[
+    float,
+    Beginning("tau_s"),
+    Field(
+        description="by how much the field that the iron had followed exceeded the first sample's, platform frame, nT"
+    ),
+]
 
 
 @error_model(
@@ -97,12 +106,17 @@ def viscous_magnetisation(
         Range(0.5, 500.0, count=7, spacing="log", sampled=True),
         Field(gt=0, description="time constant of the magnetisation, s"),
     ] = 20.0,
+    at_start_x_nT: FieldAtStart = 0.0,
+    at_start_y_nT: FieldAtStart = 0.0,
+    at_start_z_nT: FieldAtStart = 0.0,
 ) -> Terms:
     """Iron whose magnetisation follows the field late.
 
     The field through a first-order lag, minus the field, through a matrix of each sensor: nine coefficients, as
-    fractions of the field. Between recordings the field is taken to change steadily. Rivals: `eddy_current` for
-    short time constants, `hysteresis`.
+    fractions of the field. Before the survey the rig may have stood otherwise, and the iron come from there; between
+    recordings the field is taken to change steadily. Rivals: `eddy_current` for short time constants, `hysteresis`.
     """
     b = x.field_or_fields
-    return x.matrices(1e-6 * (x.lagged(b, tau_s) - b), "ppm")
+    before = np.stack([x.dying(tau_s, each) for each in (at_start_x_nT, at_start_y_nT, at_start_z_nT)], axis=-1)
+    late = x.lagged(b, tau_s) + before.reshape(len(before), *[1] * (b.ndim - 2), 3)
+    return x.matrices(1e-6 * (late - b), "ppm")

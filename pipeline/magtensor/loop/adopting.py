@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from magtensor.loop.assessment import estimated, explained
-from magtensor.loop.beginnings import beginning, extent
+from magtensor.loop.beginnings import beginning, extent, least_gain, with_beginning
 from magtensor.loop.contribution import KEEP_ALPHA, put_back, significance, slices
 from magtensor.loop.gates import Candidate
 from magtensor.loop.golden import golden
@@ -17,6 +17,7 @@ from magtensor.loop.model import Adopted, Fitting, Record, State, joint_state
 from magtensor.loop.scoring import Scorer
 from magtensor.loop.separation import SEPARATION
 from magtensor.loop.settings import Forms, Frequencies, Range, profiled
+from magtensor.loop.terms import Terms
 
 POLISH = 0.1  # of a setting, or of the width of a line, to either side
 _SWEEPS = 6  # over all settings, where two models of one kind are in
@@ -119,7 +120,7 @@ def polished(record: Record, state: State, how: Fitting) -> State:
                     continue
                 here = float(state.adopted[number].settings[name])
                 whole = abs(here) if isinstance(grid, Range) else 1.0 / state.excitation.duration
-                gain = _gain_beside_the_others(state, number)
+                gain = _Beside.of(state, number)
                 best = _near(gain, state.adopted[number].settings, name, here - POLISH * whole)
                 if best == here:
                     continue
@@ -139,7 +140,7 @@ def _in_their_forms(record: Record, state: State, how: Fitting) -> State:
         if not forms:
             continue
         ranges = {name: grid for name, grid in grids.items() if isinstance(grid, Range)}
-        gain = _gain_beside_the_others(state, number)
+        gain = _Beside.of(state, number)
         best = dict(model.settings)
         for name, grid in forms.items():
             for form in [form for form in grid.options if form != best[name]]:
@@ -157,12 +158,12 @@ def _as_they_began(record: Record, state: State, how: Fitting) -> State:
         found = beginning(model.component, model.settings)
         if found is None or not found[1].matters(model.settings):
             continue
-        name, mark = found
-        gain = _gain_beside_the_others(state, number)
+        names, mark = found
+        gain = _Beside.of(state, number)
         widest = extent(model.component, model.settings, state.excitation)
-        best = _with_beginning(gain, model.settings, name, mark.lag, widest)
-        at_rest = {**model.settings, name: 0.0}
-        if gain(best) <= gain(at_rest) + SEPARATION:  # of two settings that were free
+        best = _with_beginning(gain, model.settings, names, mark.lag, widest)
+        at_rest = {**model.settings, **dict.fromkeys(names, 0.0)}
+        if gain(best) <= gain(at_rest) + least_gain(names):
             best = at_rest
         if best != model.settings:
             state = _changed(record, state, number, best, how)
@@ -170,20 +171,15 @@ def _as_they_began(record: Record, state: State, how: Fitting) -> State:
 
 
 def _with_beginning(
-    gain: Callable[[Mapping[str, Any]], float], settings: Mapping[str, Any], name: str, lag: str, widest: float
+    gain: _Beside, settings: Mapping[str, Any], names: Sequence[str], lag: str, widest: float
 ) -> dict[str, Any]:
     """Settings with the best beginning within limits, and the lag that goes with it."""
-    from scipy.optimize import minimize_scalar
-
     best = dict(settings)
-
-    def loss(value: float) -> float:
-        return -gain({**best, name: value})
-
     for _ in range(_SWEEPS):
-        found = minimize_scalar(loss, bounds=(-widest, widest), method="bounded", options={"xatol": 4e-4 * widest})
-        best[name] = float(found.x)
-        before = best[lag]
+        found = with_beginning(gain.score.white, gain.terms, best, names, widest, _SWEEPS)
+        if found is None:
+            return best
+        before, best = best[lag], found
         best[lag] = _near(gain, best, lag, (1.0 - POLISH) * before)
         if abs(best[lag] - before) <= _RESTS * before:
             break
@@ -216,18 +212,31 @@ def _near(gain: Callable[[Mapping[str, Any]], float], settings: Mapping[str, Any
     return golden(lambda value: gain({**settings, name: value}), low, 2.0 * here - low, here)
 
 
-def _gain_beside_the_others(state: State, number: int) -> Callable[[Mapping[str, Any]], float]:
-    """What one of the adopted models explains beside the others, for given settings."""
-    now = state.adopted[number]
-    own = slices(state)[number]
-    assert state.terms is not None
-    mine = state.terms.only(range(own.start, own.stop))
-    others = [i for i in range(state.terms.count) if not own.start <= i < own.stop]
-    back = put_back(state.residual, mine, state.theta[number])
-    score = Scorer(back, state.terms.only(others) if others else None, state.colours)
+@dataclass(frozen=True)
+class _Beside:
+    """What one of the adopted models explains beside the others, for given settings.
 
-    def gain(settings: Mapping[str, Any]) -> float:
-        changed = replace(now, settings=settings)
-        return score(changed.terms(state.excitation).at(state.residual.samples))
+    Attributes:
+        own: the model; score: beside the others, in noise of the colour that all of them leave.
+    """
 
-    return gain
+    own: Adopted
+    state: State
+    score: Scorer
+
+    @classmethod
+    def of(cls, state: State, number: int) -> _Beside:
+        own = slices(state)[number]
+        assert state.terms is not None
+        mine = state.terms.only(range(own.start, own.stop))
+        others = [i for i in range(state.terms.count) if not own.start <= i < own.stop]
+        back = put_back(state.residual, mine, state.theta[number])
+        score = Scorer(back, state.terms.only(others) if others else None, state.colours)
+        return cls(state.adopted[number], state, score)
+
+    def terms(self, settings: Mapping[str, Any]) -> Terms:
+        """Its regressors at the residual's samples."""
+        return replace(self.own, settings=settings).terms(self.state.excitation).at(self.state.residual.samples)
+
+    def __call__(self, settings: Mapping[str, Any]) -> float:
+        return self.score(self.terms(settings))

@@ -30,17 +30,17 @@ def as_begun_here(
     """Effects with their coefficients, as they are on a survey that began otherwise than the calibration's."""
     begun = [(a, _tone_here(record, calibration, a, t) if a.name == TONE else t) for a, t in own]
     for number, (model, theta) in enumerate(begun):
-        name = _unknown(model)
-        if name:
-            value = _state_here(record, calibration, begun, number, name)
-            begun[number] = replace(model, settings={**model.settings, name: value}), theta
+        names = _unknown(model)
+        if names:
+            state = _state_here(record, calibration, begun, number, names)
+            begun[number] = replace(model, settings={**model.settings, **state}), theta
     return begun
 
 
-def _unknown(model: Adopted) -> str:
-    """The setting that says what a model began with, if that is not known; else ""."""
+def _unknown(model: Adopted) -> list[str]:
+    """The settings that say what a model began with, if that is not known; else none."""
     grids = profiled(model.component).items()
-    return next((n for n, g in grids if isinstance(g, Beginning) and np.isnan(model.settings.get(n, 0.0))), "")
+    return [n for n, g in grids if isinstance(g, Beginning) and np.isnan(model.settings.get(n, 0.0))]
 
 
 @dataclass(frozen=True)
@@ -99,16 +99,23 @@ def shows_a_state(raw: Array, positions_known: bool) -> bool:
 
 
 def _state_here(
-    record: Record, calibration: ArrayCalibration, own: Sequence[tuple[Adopted, Array]], number: int, name: str
-) -> float:
-    """What the lagged response of one of the effects exceeded its channel's first reading by when the survey began.
+    record: Record,
+    calibration: ArrayCalibration,
+    own: Sequence[tuple[Adopted, Array]],
+    number: int,
+    names: Sequence[str],
+) -> dict[str, float]:
+    """What the lagged response of one of the effects was out of equilibrium by when the survey began: settings.
 
-    It dies away with the lag, along vectors that are known: one number, found by least squares beside a constant, and 0
-    where slow noise could be it. With fewer than four sensors, or positions that are not known, nothing tells it from
-    a field that changes, and it is taken for 0.
+    It dies away with the lag, along vectors that are known: a number, or the components of a vector, found by least
+    squares beside a constant, and 0 where slow noise could be it. With fewer than four sensors, or positions that are
+    not known, nothing tells it from a field that changes, and it is taken for 0.
     """
+    from scipy.special import chdtrc, chdtri
+
+    none = dict.fromkeys(names, 0.0)
     if not shows_a_state(record.raw, record.position is not None):
-        return 0.0
+        return none
     contrast = _Contrast.of(record, calibration)
     raw = np.where(contrast.usable[:, None, None], record.raw, 0.0)
     b = calibration.apply(raw)
@@ -119,19 +126,21 @@ def _state_here(
         return effect.terms(x).contribution(theta, raw[0].size).reshape(raw.shape)
 
     model, theta = own[number]
-    unit = replace(model, settings={**model.settings, name: 1.0})
-    left = contrast(raw - calibration.offset - sum(added(*each) for each in own))
-    course = contrast(added(unit, theta) - added(model, theta))
-    if not contrast.usable.any() or float(np.sum(course**2)) <= 0.0:
-        return 0.0
-    left, course = left - left.mean(axis=0), course - course.mean(axis=0)
-    power = float(np.sum(course**2))
-    value = float(np.sum(course * left)) / power
+    rest = added(model, theta)
+    left = contrast(raw - calibration.offset - rest - sum(added(*e) for i, e in enumerate(own) if i != number))
+    units = [replace(model, settings={**model.settings, **none, name: 1.0}) for name in names]
+    courses = np.stack([contrast(added(unit, theta) - rest) for unit in units], axis=-1)
+    if not contrast.usable.any() or float(np.sum(courses**2)) <= 0.0:
+        return none
+    left, courses = left - left.mean(axis=0), courses - courses.mean(axis=0)
+    state = np.linalg.lstsq(courses.reshape(-1, len(names)), left.ravel(), rcond=1e-6)[0]
+    course = courses @ state
     # noise along the course's vectors, of its own colour: means over a lag tell more of it than single samples do
     along = np.linalg.svd(course, full_matrices=False)[2][0]
-    noise = (left - value * course) @ along
-    grid = next(g for n, g in profiled(model.component).items() if n == name)
+    noise = (left - course) @ along
+    grid = next(g for n, g in profiled(model.component).items() if n == names[0])
     parts = max(int(np.ptp(record.time) / float(model.settings[grid.lag])), LEAST_PARTS)
     means = np.array([part.mean() for part in np.array_split(noise, min(parts, len(noise)))])
     variance = max(float(np.var(noise)), float(np.var(means)) * len(noise) / len(means))
-    return value if value**2 * power > SIGNIFICANT**2 * variance else 0.0
+    least = float(chdtri(len(names), chdtrc(1, SIGNIFICANT**2)))
+    return dict(zip(names, map(float, state), strict=True)) if np.sum(course**2) > least * variance else none

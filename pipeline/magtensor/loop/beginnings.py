@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -20,33 +20,114 @@ from magtensor.loop.separation import SEPARATION
 from magtensor.loop.settings import AnyChannel, Beginning, Orders, profiled
 from magtensor.loop.terms import Terms, joined
 
+WIDEST = 10.0  # a body brought out of a warm car, over the width of what the thermometer tells during the survey
+_SLOPE = 1e-3  # of the widest beginning, over which the regressors' change is taken
 
-def beginning(model: Component, settings: Mapping[str, Any]) -> tuple[str, Beginning] | None:
-    """The setting that says what a model began with; None where it has none, or the lag is given."""
+
+def beginning(model: Component, settings: Mapping[str, Any]) -> tuple[list[str], Beginning] | None:
+    """The settings that say what a model began with, a number or the components of a vector; None where it has none, or
+    the lag is given."""
     grids = profiled(model)
-    found = ((n, g) for n, g in grids.items() if isinstance(g, Beginning) and g.lag in grids)
-    return next(((n, g) for n, g in found if not settings.get(g.unless)), None)
+    found = [(n, g) for n, g in grids.items() if isinstance(g, Beginning) and g.lag in grids]
+    names = [n for n, g in found if not settings.get(g.unless)]
+    return (names, found[0][1]) if names else None
 
 
 def extent(model: Component, settings: Mapping[str, Any], x: Excitation) -> float:
-    """The width of the channel that a model follows: what its response may be out of equilibrium by."""
-    channel, grid = next((n, g) for n, g in profiled(model).items() if isinstance(g, AnyChannel))
-    return float(np.ptp(x.channel(grid.pick(x, str(settings[channel]))), axis=0).max())
+    """What a response may be out of equilibrium by: ten times the width of the channel that it follows, or twice the
+    field."""
+    channel = next(((n, g) for n, g in profiled(model).items() if isinstance(g, AnyChannel)), None)
+    if channel is None:
+        return 2.0 * float(np.linalg.norm(x.field_or_fields, axis=-1).max())
+    name, grid = channel
+    return WIDEST * float(np.ptp(x.channel(grid.pick(x, str(settings[name]))), axis=0).max())
+
+
+def with_beginning(
+    white: Whitened,
+    terms: Callable[[Mapping[str, Any]], Terms],
+    settings: Mapping[str, Any],
+    names: Sequence[str],
+    widest: float,
+    steps: int = 1,
+) -> dict[str, Any] | None:
+    """Settings with the beginning that explains most, within limits; None where nothing is explained.
+
+    At first the coefficients and what dies away are fitted freely, then the beginning with the coefficients: they are
+    a product, and each step is one of Gauss and Newton.
+
+    Parameters
+    ----------
+    white: the residual, what is given already in it.
+    terms: the regressors of settings, at the residual's samples.
+    names: of the settings that say what the response began with, each +-widest at most.
+    """
+    here = {**settings, **dict.fromkeys(names, 0.0)}
+    value = np.zeros(len(names))
+    theta = None
+    for step in range(steps):
+        now = terms(here)
+        slopes = _slopes(terms, here, now, names, widest)
+        if theta is None:
+            dying = slopes[0].only(_moving(slopes[0]))
+            free = estimated_in(white, joined([now, dying])).theta
+            theta = free[len(free) - dying.count - now.count : len(free) - dying.count]
+        outputs = len(white.residual.noise)
+        courses = [_one(slope.contribution(theta, outputs), n) for slope, n in zip(slopes, names, strict=True)]
+        estimate = estimated_in(white, joined([now, *courses]))
+        own = estimate.theta[-now.count - len(names) :]
+        theta, moved = own[: now.count], own[now.count :]
+        if not np.any(theta):
+            return None
+        value = np.clip(value + moved, -widest, widest)
+        here.update(zip(names, map(float, value), strict=True))
+        if np.all(np.abs(moved) < _SLOPE * widest) and step:
+            break
+    return here
+
+
+def what_dies_away(
+    terms: Callable[[Mapping[str, Any]], Terms], settings: Mapping[str, Any], names: Sequence[str], widest: float
+) -> Terms:
+    """What a response was out of equilibrium by, with free coefficients and nothing beside it."""
+    slope = _slopes(terms, settings, terms(settings), names[:1], widest)[0]
+    return slope.only(_moving(slope))  # a vector's components die away in the same outputs
+
+
+def _slopes(
+    terms: Callable[[Mapping[str, Any]], Terms],
+    settings: Mapping[str, Any],
+    now: Terms,
+    names: Sequence[str],
+    widest: float,
+) -> list[Terms]:
+    """The changes of the regressors with what the response began with."""
+    step = _SLOPE * widest
+    moved = (terms({**settings, name: settings[name] + step}) for name in names)
+    return [replace(now, series=(each.series - now.series) / step) for each in moved]
+
+
+def _moving(slope: Terms) -> list[int]:
+    """The numbers of the terms that change."""
+    changing = np.any(slope.series != 0.0, axis=0)
+    return sorted({int(t) for t, s in zip(slope.part_term, slope.part_series, strict=True) if changing[s]})
+
+
+def _one(course: np.ndarray[Any, Any], name: str) -> Terms:
+    """One coefficient for a pattern (N, 3 S)."""
+    outputs = np.arange(course.shape[1])
+    return Terms((name,), ("",), ("",), course, np.zeros_like(outputs), outputs, outputs)
 
 
 def begun(
     model: Component, settings: dict[str, Any], state: State, few: tuple[Residual, Terms | None]
 ) -> dict[str, Any]:
     """Settings of a model with the lag and the beginning that explain most together, if the data separate them from
-    those given.
-
-    For each lag the coefficients of the channel and of what dies away are fitted freely; the beginning is the part of
-    the first that is in the second. Of powers of the channel the lowest alone is asked.
-    """
+    those given. Of powers of a channel the lowest alone is asked."""
     found = beginning(model, settings)
     if found is None:
         return settings
-    name, mark = found
+    names, mark = found
     residual, given = few
     x = state.excitation
     widest = extent(model, settings, x)
@@ -60,17 +141,7 @@ def begun(
     orders = {n: min(g.options) for n, g in grids.items() if isinstance(g, Orders)}  # squares imitate what dies away
 
     def with_lag(lag: float) -> dict[str, Any] | None:
-        at_rest = {**settings, **orders, mark.lag: lag, name: 0.0}
-        rest, moved = terms(at_rest), terms({**at_rest, name: widest})
-        dying = replace(moved, series=moved.series - rest.series)
-        estimate = estimated_in(white, joined([rest, dying]))
-        size = rest.count
-        own, its = estimate.theta[-2 * size : -size], estimate.theta[-size:]
-        weights = estimate.normal[-2 * size : -size, -2 * size : -size]
-        power = float(own @ weights @ own)
-        if not power > 0:
-            return None
-        return {**at_rest, name: widest * float(np.clip(own @ weights @ its / power, -1.0, 1.0))}
+        return with_beginning(white, terms, {**settings, **orders, mark.lag: lag}, names, widest)
 
     def gain(lag: float) -> float:
         found = with_lag(lag)
@@ -83,7 +154,13 @@ def begun(
         return settings
     together = terms(best) if given is None else joined([given, terms(best)])
     fair = Scorer(residual, given, likeliest(residual, together, [colours_of(residual), WHITE]).colours)
-    if fair(terms(best)) <= fair(terms(settings)) + SEPARATION:
+    alone = what_dies_away(terms, best, names, widest)  # warming up, say, and no response to the channel
+    if fair(terms(best)) <= max(fair(terms(settings)), fair(alone)) + least_gain(names):
         return settings
     low, high = lags[max(nearest - 1, 0)], lags[min(nearest + 1, len(lags) - 1)]
     return with_lag(golden(gain, low, high, lags[nearest])) or best
+
+
+def least_gain(names: Sequence[str]) -> float:
+    """The log likelihood ratio that separates a beginning from equilibrium, the lag having been free as well."""
+    return (1 + len(names)) * SEPARATION / 2.0

@@ -141,11 +141,17 @@ class Excitation:
         if not (lag_s or smooth):
             return self.logged[name]
         seen = self._course(name, lag_s, delayed, smooth)
-        if lag_s <= 0 or delayed or not at_start or np.isnan(at_start):
+        if lag_s <= 0 or delayed:
             return seen
+        return seen + self.dying(lag_s, at_start).reshape(-1, *[1] * (seen.ndim - 1))
+
+    def dying(self, tau: float, at_start: float) -> Array:
+        """(N,) what is left of what a first-order lag tau, s, was out of equilibrium by when the survey began; none
+        where that is not known."""
+        if not at_start or np.isnan(at_start):
+            return np.zeros(len(self.time))
         whole = self.part_of[0] if self.part_of else self
-        gone = np.exp((whole.time[0] - self.time) / lag_s)
-        return seen + at_start * gone.reshape(-1, *[1] * (seen.ndim - 1))
+        return at_start * np.exp((whole.time[0] - self.time) / tau)
 
     def thermometer(self, name: str, lag_s: float = 0.0, delayed: bool = False, at_start: float = 0.0) -> Array:
         """A logged temperature without the noise of its log, seen through a lag as in `channel`: what has a thermal
