@@ -1,8 +1,13 @@
-"""What a second function of a channel gains of the noise of its log is no effect; what gains far more may be one."""
+"""What a second function of a channel, or a second log of a cause, gains of the noise of a log is no effect; what gains
+far more may be one."""
 
 from __future__ import annotations
 
+from pathlib import Path
+from typing import Any
+
 import pytest
+from loop_cases import BASE, adopted_names, scenario, suspects, verdict_of
 from scipy.stats import ncx2
 
 from magtensor.loop.gates import gained_of_a_log
@@ -18,3 +23,45 @@ def test_noise_seldom_gains_more_and_an_effect_beside_it_does(log_noise: float, 
 
 def test_without_noise_nothing_is_gained() -> None:
     assert gained_of_a_log(0.0, 12) == 0.0
+
+
+def on_a_bus(*effects: dict[str, Any], current_noise_A: float) -> dict[str, Any]:
+    """A survey with two currents, and the voltage that sags under both."""
+    switched = {"type": "switched", "levels": [0.0, 1.5], "log_noise": current_noise_A}
+    channels = {
+        "temperature": BASE["channels"]["temperature"],
+        "current_motor": switched | {"mean_hold_s": 35.0},
+        "current_pump": switched | {"mean_hold_s": 50.0},
+        "supply_voltage": {
+            "type": "supply", "resistance_ohm": 0.2, "loads": ["current_motor", "current_pump"],
+            "wander_rms_V": 0.005, "log_noise": 0.003,
+        },
+    }  # fmt: skip
+    return scenario(71, *effects, channels=channels)
+
+
+OF_A_BUS = ["current_field", "supply_offset", "channel_response", "temperature_offset"]
+MOTOR = {"type": "current_field", "channel": "current_motor", "rms_nT": 3.0}
+PUMP = {"type": "current_field", "channel": "current_pump", "rms_nT": 2.0}
+SUPPLY = {"type": "supply_offset", "rms_nT": 2.0}
+
+
+def test_a_voltage_that_knows_the_currents_better_than_their_logs_is_no_third_effect(tmp_path: Path) -> None:
+    told = verdict_of(tmp_path, on_a_bus(MOTOR, PUMP, current_noise_A=0.02), models=OF_A_BUS)
+    channels = [(a["error_model"], a["settings"]["channel"]) for a in told["adopted"]]
+    assert sorted(channels) == [("current_field", "current_motor"), ("current_field", "current_pump")]
+
+
+def test_an_effect_of_the_voltage_beside_that_of_a_noisy_current_is_found(tmp_path: Path) -> None:
+    survey = on_a_bus(MOTOR, SUPPLY, current_noise_A=0.02)
+    survey["channels"]["supply_voltage"]["wander_rms_V"] = 0.1  # else the pump's current is as good
+    told = verdict_of(tmp_path, survey, models=OF_A_BUS)
+    assert adopted_names(told) == {"current_field", "supply_offset"}
+
+
+def test_of_two_logs_of_one_cause_the_noisier_is_named_as_a_rival(tmp_path: Path) -> None:
+    survey = on_a_bus(MOTOR, current_noise_A=0.03)
+    survey["channels"]["supply_voltage"]["loads"] = ["current_motor"]
+    told = verdict_of(tmp_path, survey, models=OF_A_BUS)
+    assert len(told["adopted"]) == 1
+    assert "current_field" in suspects(told)

@@ -150,7 +150,7 @@ def why(candidate: Candidate, winner: Candidate | None) -> str:
     if not candidate.significant:
         return f"not significant: {figures}"
     if candidate.of_the_log and candidate.log_noise > 0:
-        return f"noise in the log of its channel, which another model brought in, explains as much: {figures}"
+        return f"noise in the log of a channel, which another model brought in, explains as much: {figures}"
     if candidate.of_second_order:
         return f"less than 0.3 % of what is adopted, whose next order would explain as much: {figures}"
     if not candidate.beyond_slow_noise:

@@ -12,7 +12,7 @@ from magtensor.components import Component
 from magtensor.loop.assessment import WHITE, Assessment, assess
 from magtensor.loop.evidence import Whitened
 from magtensor.loop.gates import Candidate, explained_before
-from magtensor.loop.log_noise import brought_in
+from magtensor.loop.log_noise import brought_in, channels_of, of_another_log
 from magtensor.loop.model import Adopted, State
 from magtensor.loop.profiling import REFINING_SAMPLES, SCREENING_SAMPLES, Thinned, best_settings, refined, terms_of
 from magtensor.loop.scoring import Scorer
@@ -39,7 +39,9 @@ def candidates_of(state: State, models: Sequence[Component], failed: dict[str, s
     null = _holm([a.null_p * tried for _, tried, _, a in found], len(names))
     beside = explained_before(state)
     candidates = [
-        Candidate(model, tried, terms, assessment, p, null_p, alpha, _log_noise(state, model), beside)
+        Candidate(
+            model, tried, terms, assessment, p, null_p, alpha, _log_noise(state, model, terms, assessment), beside
+        )
         for (model, tried, terms, assessment), p, null_p in zip(found, adjusted, null, strict=True)
     ]
     return sorted(candidates, key=lambda c: -c.assessment.gain.total)
@@ -152,8 +154,9 @@ def _one_each(state: State, assessed: Sequence[Assessed]) -> list[Assessed]:
     return [lowest(state, several, profiled(several[0][0].component)) for several in named.values()]
 
 
-def _log_noise(state: State, model: Adopted) -> float:
-    return brought_in(state, model.settings) if generic(model) else 0.0
+def _log_noise(state: State, model: Adopted, terms: Terms, assessment: Assessment) -> float:
+    same = brought_in(state, channels_of(model, state.excitation)) if generic(model) else 0.0
+    return max(same, of_another_log(state, model, terms, assessment.estimate))
 
 
 def generic(model: Adopted) -> bool:
