@@ -23,7 +23,7 @@ from magtensor.loop.excitation import Excitation
 from magtensor.loop.residual import Residual, residual_of, taken_off
 from magtensor.loop.station import Station
 from magtensor.loop.statistics import Estimate
-from magtensor.loop.stretches import borne_out
+from magtensor.loop.stretches import borne_out, louder
 from magtensor.loop.terms import Terms, joined
 
 MOST_ROUNDS = 6
@@ -327,9 +327,9 @@ def _fit(
         if not how.complete:  # refused with slack, it is refused without, and by the figures that were asked for
             _fit(record, raw, reference, replace(how, complete=True), keep)
         raise
-    if keep is not None or fit.keep.all() or not how.searching:
+    if keep is not None or fit.keep.all():
         return fit
-    more = borne_out(fit, raw, reference, how.reference_noise)
+    more = (borne_out if how.searching else louder)(fit, raw, reference, how.reference_noise)
     return fit if np.array_equal(more, fit.keep) else fitted(more)
 
 
