@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from loop_cases import adopted_names, lasting_effects, loaded, scenario, verdict_of
+from loop_cases import adopted_names, lasting_effects, loaded, scenario, suspects, verdict_of
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 from scipy.stats import norm
@@ -200,3 +200,11 @@ def test_a_tone_is_taken_off_with_the_phase_and_strength_it_has_here(
     raw = corrected_raw(disturbed, calibration, [model], [theta])
     # two numbers found from 32 000 contrasts with 0.15 nT of noise each
     assert np.std(raw - record.raw) < 0.01
+
+
+def test_a_lag_longer_than_the_survey_gives_way_to_a_drift(tmp_path: Path) -> None:
+    """A thermometer through a lag of twenty minutes is as good a drift on this survey, and not on the next one."""
+    drifting = scenario(8, {"type": "offset_drift", "rms_nT": 0.45})
+    told = verdict_of(tmp_path, drifting, models=["offset_drift", "temperature_offset", "warm_up"])
+    assert adopted_names(told) == {"offset_drift"}
+    assert "temperature_offset" in suspects(told)

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field, replace
 from magtensor.components import Component
 from magtensor.errors import DataError
 from magtensor.loop.adopting import adopt, narrowed, polished
+from magtensor.loop.beginnings import beginning
 from magtensor.loop.changing_matrix import channel_instead
 from magtensor.loop.contribution import agrees, eliminate, without_models
 from magtensor.loop.exchange import looked_at_again, simpler
@@ -33,6 +34,7 @@ from magtensor.loop.spectrum import spectral_lines
 from magtensor.loop.trial import Trial, on_the_folds_of, per_sample, trial
 
 MOST_EFFECTS = 8
+SLOW = 0.5  # of the survey: a longer lag is no better known than a drift
 ROUNDING = 1e-4  # mean square of the whitened residual: far below the least noise that any sensor is believed to have
 
 
@@ -295,8 +297,10 @@ def simplest(best: Candidate, possible: Sequence[Candidate], state: State) -> tu
 
     Nor are two told apart by less than the next order of what both explain, and a channel that nobody wrote a model for
     from the model that names its effect by less than that one's law may miss.
-    Simplest is more of what was adopted already, with another setting; then what has the fewest coefficients.
     Nor is one of the same vectors that is behind by no more than the noise of its log.
+
+    Simplest is more of what was adopted already, with another setting; then what has the fewest coefficients; a
+    response that lags by half the survey or longer comes after both.
     A model that slow noise could explain is named, and not chosen before one that it could not.
     """
     colours = best.assessment.colours
@@ -317,8 +321,9 @@ def simplest(best: Candidate, possible: Sequence[Candidate], state: State) -> tu
             equal.append(other)
     known = {a.name for a in state.adopted}
 
-    def complexity(c: Candidate) -> tuple[bool, bool, int, float]:
-        return generic(c.model), c.model.name not in known, c.assessment.estimate.rank, -c.assessment.gain.total
+    def complexity(c: Candidate) -> tuple[bool, bool, bool, int, float]:
+        slow, new = _hardly_begun(c, state.excitation), c.model.name not in known
+        return generic(c.model), slow, new, c.assessment.estimate.rank, -c.assessment.gain.total
 
     chosen = min((c for c in equal if c is best or c.passes), key=complexity)
     return chosen, tuple(sorted({c.model.name for c in equal if c is not chosen} - {chosen.model.name}))
@@ -336,6 +341,13 @@ def _badly_logged(best: Candidate, other: Candidate, behind: float, state: State
     if not pattern.any() or not along_the_same(own, own_of(best.assessment.estimate, first), pattern):
         return False
     return behind <= gained_of_a_log(would_bring_in(state, other.model, its), other.assessment.estimate.rank)
+
+
+def _hardly_begun(candidate: Candidate, x: Excitation) -> bool:
+    """Whether a response lags by half the survey or more: what it followed was over before it began, and a channel seen
+    through such a lag can be any drift."""
+    found = beginning(candidate.model.component, candidate.model.settings)
+    return found is not None and float(candidate.model.settings[found[1].lag]) > SLOW * x.duration
 
 
 def _channel(candidate: Candidate) -> str:
