@@ -131,7 +131,7 @@ def sought(state: State, record: Record) -> Sought | None:
         gain=gain,
         like=like,
         switches=course.switches,
-        of_the_log=gain.total <= gained_of_a_log(_of_the_logs(state), len(seen)),
+        of_the_log=gain.total <= gained_of_a_log(brought_in(state), len(seen)),
         objection=objection,
         left_by=left_by,
     )
@@ -302,12 +302,6 @@ def _effective(coefficients: Array, covariance: Array) -> float:
     m = len(covariance)
     alike = (products.sum() - np.trace(products)) / (m * (m - 1))
     return len(coefficients) / max(alike, 1.0)
-
-
-def _of_the_logs(state: State) -> float:
-    """Sum of squares that noise in the logs of all adopted channels brings in: it follows one waveform as well."""
-    channels = {v: v for a in state.adopted for v in a.settings.values() if isinstance(v, str)}
-    return brought_in(state, channels) if channels else 0.0
 
 
 def lowest(series: Array, band: int) -> Array:

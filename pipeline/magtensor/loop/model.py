@@ -190,8 +190,8 @@ class Fitting:
         worst_error: accepted predicted error of |b|, a fraction of F.
         noise: (S, 3) nT or None.
         complete: whether what the fit leaves is noise; while effects are still being searched it is not.
-        searching: samples beyond all noise are believed where their neighbours agree (`stretches`): an effect may yet
-            explain them.
+        searching: samples beyond all noise are believed where their neighbours agree (`stretches`), for an effect may
+            yet explain them; otherwise where the noise is louder than elsewhere.
         nominal: what is assumed of the sensors where the attitudes do not determine them; None where they do.
     """
 

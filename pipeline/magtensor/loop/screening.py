@@ -12,12 +12,13 @@ from magtensor.components import Component
 from magtensor.loop.assessment import WHITE, Assessment, assess
 from magtensor.loop.evidence import Whitened
 from magtensor.loop.gates import Candidate, explained_before
-from magtensor.loop.log_noise import brought_in, channels_of, of_another_log
+from magtensor.loop.log_noise import brought_in, channels_of
 from magtensor.loop.model import Adopted, State
 from magtensor.loop.profiling import REFINING_SAMPLES, SCREENING_SAMPLES, Thinned, best_settings, refined, terms_of
 from magtensor.loop.scoring import Scorer
 from magtensor.loop.separation import Assessed, lower_orders, lowest
 from magtensor.loop.settings import profiled
+from magtensor.loop.several_logs import of_another_log
 from magtensor.loop.terms import Terms
 from magtensor.sharing import shared_out
 

@@ -20,9 +20,8 @@ from magtensor.loop.contribution import agrees, eliminate, without_models
 from magtensor.loop.exchange import looked_at_again, simpler
 from magtensor.loop.excitation import Excitation
 from magtensor.loop.found import Search, Step
-from magtensor.loop.gates import ALPHA, OF_THE_LAW, SECOND_ORDER, Candidate, gained_of_a_log
+from magtensor.loop.gates import ALPHA, OF_THE_LAW, SECOND_ORDER, Candidate
 from magtensor.loop.latent import NAME, Sought, Source, renewed, sought, tried_source
-from magtensor.loop.log_noise import along_the_same, channels_of, own_of, vector_of, would_bring_in
 from magtensor.loop.model import Adopted, Fitting, Record, State, joint_state
 from magtensor.loop.needs import missing
 from magtensor.loop.overshadowed import overshadowed
@@ -30,6 +29,7 @@ from magtensor.loop.profiling import repeatable
 from magtensor.loop.screening import candidates_of, generic
 from magtensor.loop.separation import SEPARATION, fold_gain, separated
 from magtensor.loop.settings import AnyChannel, EventTimes, profiled
+from magtensor.loop.several_logs import worse_log
 from magtensor.loop.spectrum import spectral_lines
 from magtensor.loop.trial import Trial, on_the_folds_of, per_sample, trial
 
@@ -295,9 +295,9 @@ def _containing(best: Candidate, possible: Sequence[Candidate], state: State) ->
 def simplest(best: Candidate, possible: Sequence[Candidate], state: State) -> tuple[Candidate, tuple[str, ...]]:
     """The simplest of the models that the held-out blocks do not separate from the best, and the others' names.
 
-    Nor are two told apart by less than the next order of what both explain, and a channel that nobody wrote a model for
-    from the model that names its effect by less than that one's law may miss.
-    Nor is one of the same vectors that is behind by no more than the noise of its log.
+    Nor are two told apart by less than the next order of what both explain, a channel that nobody wrote a model for
+    from the model that names its effect by less than that one's law may miss, and two logs of one cause by the noise of
+    the worse one.
 
     Simplest is more of what was adopted already, with another setting; then what has the fewest coefficients; a
     response that lags by half the survey or longer comes after both.
@@ -312,12 +312,9 @@ def simplest(best: Candidate, possible: Sequence[Candidate], state: State) -> tu
         spare = max(other.assessment.estimate.rank - best.assessment.estimate.rank, 0)
         found = fold_gain(state, colours, other.terms)
         named = generic(best.model) and not generic(other.model) and _channel(best) == _channel(other)
-        alike = reference.over(found).total <= (OF_THE_LAW if named else SECOND_ORDER) * reference.total
-        if (
-            alike
-            or not separated(reference, found, spare)
-            or _badly_logged(best, other, reference.over(found).total, state)
-        ):
+        behind = reference.over(found).total
+        alike = behind <= (OF_THE_LAW if named else SECOND_ORDER) * reference.total
+        if alike or not separated(reference, found, spare) or worse_log(best, other, behind, state):
             equal.append(other)
     known = {a.name for a in state.adopted}
 
@@ -327,20 +324,6 @@ def simplest(best: Candidate, possible: Sequence[Candidate], state: State) -> tu
 
     chosen = min((c for c in equal if c is best or c.passes), key=complexity)
     return chosen, tuple(sorted({c.model.name for c in equal if c is not chosen} - {chosen.model.name}))
-
-
-def _badly_logged(best: Candidate, other: Candidate, behind: float, state: State) -> bool:
-    """Whether another model has the vectors of the best one, and the noise of its log explains what it is behind by: of
-    a current and the voltage that sags under it the one that is logged better explains more, whichever acts."""
-    x = state.excitation
-    if not (channels_of(best.model, x) and channels_of(other.model, x)):
-        return False
-    first = len(best.assessment.estimate.theta) - best.terms.count
-    own, its = best.assessment.estimate.theta[first:], other.assessment.estimate.theta[first:]
-    pattern = vector_of(other.terms, its, best.terms)[:, None]
-    if not pattern.any() or not along_the_same(own, own_of(best.assessment.estimate, first), pattern):
-        return False
-    return behind <= gained_of_a_log(would_bring_in(state, other.model, its), other.assessment.estimate.rank)
 
 
 def _hardly_begun(candidate: Candidate, x: Excitation) -> bool:
