@@ -91,7 +91,11 @@ def apply(
     words = str(found["calibrated/b"].attrs["rotation_refined"]) if refine_rotation else ""
     told = _told(found["calibrated/b"].attrs) if "calibrated/b" in found else ""
     attributes = found["calibrated/b"].attrs if "calibrated/b" in found else {}
-    each = {"NOT taken off": "not_taken_off", "extrapolated": "extrapolated"}
+    each = {
+        "NOT taken off": "not_taken_off",
+        "extrapolated": "extrapolated",
+        "begins anew with this survey": "begins_anew",
+    }
     told_of = (f"{what}: {attributes[name]}" for what, name in each.items() if name in attributes)
     notes = (*summary(found.flags), *told_of)
     return Applied(target, fit_in_words(survey_block(found)) + told, words, notes)
@@ -167,7 +171,7 @@ def apply_and_refine(
     from magtensor.calibration.surveys.corrections import with_scatter
     from magtensor.dated import at_date_of
     from magtensor.effect_errors import taken_off
-    from magtensor.loop.stored import cleaned, extrapolated, left_in, on_its_clock, stored_effects
+    from magtensor.loop.stored import begins_again, cleaned, extrapolated, left_in, on_its_clock, stored_effects
     from magtensor.offsets_apart import scatter_for, without_scatter
     from magtensor.platform_frame import as_fitted, with_refined_rotation
     from magtensor.standing_out import flagged
@@ -185,7 +189,7 @@ def apply_and_refine(
         apart = scatter_for(survey, calibration) if scatter is None else scatter
         fitted = with_scatter(fitted, apart)
         adopted, theta, means = stored_effects(calibration, planned.registry)
-        adopted = on_its_clock(adopted, calibration, survey)
+        adopted = on_its_clock(adopted, theta, means, calibration, as_fitted(calibration, fitted), survey)
         before, survey = survey, cleaned(survey, as_fitted(calibration, fitted), adopted, theta, means)
         if judge:
             known = calibration.values("calibration/noise_std") if "calibration/noise_std" in calibration else None
@@ -193,6 +197,7 @@ def apply_and_refine(
         words = {
             "not_taken_off": left_in(survey, adopted),
             "extrapolated": extrapolated(before, calibration, adopted, means),
+            "begins_anew": begins_again(adopted),
         }
         survey = survey.merged(_named(corrected(fitted, survey, **words), calibration, dated, apart))
         if refine_rotation:

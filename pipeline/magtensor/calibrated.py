@@ -94,7 +94,8 @@ def corrected(calibration: ArrayCalibration, survey: Survey, **words: str) -> di
     """`calibrated/b` of every sample and, where the total field is known, `residual/total_field`, after and before.
 
     `words` become attributes where they say something: `not_taken_off` names effects that are still in it,
-    `extrapolated` those taken off beyond what the calibration has seen.
+    `extrapolated` those taken off beyond what the calibration has seen, `begins_anew` those of a time that goes on from
+    the calibration's survey to another one as a rule, and with this one began again.
     """
     raw = np.asarray(survey.values("b_raw"), dtype=float)
     b = calibration.apply(raw)

@@ -1,6 +1,7 @@
-"""What a survey began with and a calibration cannot know: the phase of a tone, the state of a response that lags.
+"""What a survey began with and a calibration cannot know: the phase of a tone, the state of a response that lags, and
+whether what drifts or happens at a time goes on from the survey of the calibration or begins anew.
 
-Both are found from the survey's own outputs, in what neither a uniform field nor a gradient can make of them, so that
+All are found from the survey's own outputs, in what neither a uniform field nor a gradient can make of them, so that
 nothing a survey may be looking for is taken for an error of the instrument.
 """
 
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 
 from magtensor.calibration.by_sensor import by_sensor
 from magtensor.calibration.types import Array, ArrayCalibration
+from magtensor.loop.excitation import Excitation
 from magtensor.loop.model import Adopted, Record
 from magtensor.loop.settings import Beginning, profiled
 from magtensor.tensor.geometry import array_design
@@ -22,6 +24,7 @@ TONE = "periodic_interference"
 LEAST_CONTRAST = 1e-4  # of an effect's own power, between the sensors
 SIGNIFICANT = 4.0  # standard deviations of what a lagged response began with
 LEAST_PARTS = 8  # of the survey, whose means tell how large slow noise is
+ANEW = 0.5  # of the difference between beginning anew and going on
 
 
 def as_begun_here(
@@ -116,31 +119,87 @@ def _state_here(
     none = dict.fromkeys(names, 0.0)
     if not shows_a_state(record.raw, record.position is not None):
         return none
-    contrast = _Contrast.of(record, calibration)
-    raw = np.where(contrast.usable[:, None, None], record.raw, 0.0)
-    b = calibration.apply(raw)
-    forward = np.asarray(np.linalg.inv(calibration.matrix), dtype=float)
-    x = record.excitation(by_sensor(forward, b) + calibration.offset, b, matrix=forward)
-
-    def added(effect: Adopted, theta: Array) -> Array:
-        return effect.terms(x).contribution(theta, raw[0].size).reshape(raw.shape)
-
+    here = _Here.of(record, calibration)
     model, theta = own[number]
-    rest = added(model, theta)
-    left = contrast(raw - calibration.offset - rest - sum(added(*e) for i, e in enumerate(own) if i != number))
+    left = here.left(own)
+    rest = here.added(model, theta)
     units = [replace(model, settings={**model.settings, **none, name: 1.0}) for name in names]
-    courses = np.stack([contrast(added(unit, theta) - rest) for unit in units], axis=-1)
-    if not contrast.usable.any() or float(np.sum(courses**2)) <= 0.0:
+    courses = np.stack([here.added(unit, theta) - rest for unit in units], axis=-1)
+    if not len(left) or float(np.sum(courses**2)) <= 0.0:
         return none
     left, courses = left - left.mean(axis=0), courses - courses.mean(axis=0)
     state = np.linalg.lstsq(courses.reshape(-1, len(names)), left.ravel(), rcond=1e-6)[0]
     course = courses @ state
-    # noise along the course's vectors, of its own colour: means over a lag tell more of it than single samples do
-    along = np.linalg.svd(course, full_matrices=False)[2][0]
-    noise = (left - course) @ along
     grid = next(g for n, g in profiled(model.component).items() if n == names[0])
     parts = max(int(np.ptp(record.time) / float(model.settings[grid.lag])), LEAST_PARTS)
-    means = np.array([part.mean() for part in np.array_split(noise, min(parts, len(noise)))])
-    variance = max(float(np.var(noise)), float(np.var(means)) * len(noise) / len(means))
     least = float(chdtri(len(names), chdtrc(1, SIGNIFICANT**2)))
-    return dict(zip(names, map(float, state), strict=True)) if np.sum(course**2) > least * variance else none
+    known = np.sum(course**2) > least * _variance(left - course, course, parts)
+    return dict(zip(names, map(float, state), strict=True)) if known else none
+
+
+@dataclass(frozen=True)
+class _Here:
+    """What effects add to the outputs of a survey, and what is left of these without them, both as contrasts."""
+
+    record: Record
+    calibration: ArrayCalibration
+    contrast: _Contrast
+    excitation: Excitation
+
+    @classmethod
+    def of(cls, record: Record, calibration: ArrayCalibration) -> _Here:
+        contrast = _Contrast.of(record, calibration)
+        b = calibration.apply(np.where(contrast.usable[:, None, None], record.raw, 0.0))
+        forward = np.asarray(np.linalg.inv(calibration.matrix), dtype=float)
+        x = record.excitation(by_sensor(forward, b) + calibration.offset, b, matrix=forward)
+        return cls(record, calibration, contrast, x)
+
+    def added(self, effect: Adopted, theta: Array) -> Array:
+        """(n, 3 S) nT."""
+        raw = self.record.raw
+        return self.contrast(effect.terms(self.excitation).contribution(theta, raw[0].size).reshape(raw.shape))
+
+    def left(self, own: Sequence[tuple[Adopted, Array]]) -> Array:
+        """(n, 3 S) nT without effects; what began unknown began in equilibrium."""
+        left = self.contrast(self.record.raw - self.calibration.offset)
+        for effect in own:
+            left = left - self.added(*effect)
+        return left
+
+
+def _variance(noise: Array, course: Array, parts: int) -> float:
+    """nT^2, of noise (n, 3 S) along the vectors of a course (n, 3 S), of its own colour: means over parts of the survey
+    tell more of it than single samples do."""
+    along = noise @ np.linalg.svd(course, full_matrices=False)[2][0]
+    means = np.array([part.mean() for part in np.array_split(along, min(parts, len(along)))])
+    return max(float(np.var(along)), float(np.var(means)) * len(along) / len(means))
+
+
+def begins_anew(
+    record: Record, calibration: ArrayCalibration, own: Sequence[tuple[Adopted, Array]], number: int
+) -> bool:
+    """Whether an effect that is known to go with the time since the survey of the calibration began goes with the time
+    since this one did.
+
+    A drift of what is switched on with the survey, a jump at the same time of each. Beginning anew has to be nearer to
+    the outputs, and its course to be seen in them whatever the offsets are, which differ from survey to survey. A
+    steady drift that goes on has the course too, and is elsewhere.
+    """
+    model, theta = own[number]
+    if model.start in (None, record.start) or not shows_a_state(record.raw, record.position is not None):
+        return False
+    here = _Here.of(record, calibration)
+    course = here.added(replace(model, start=None), theta) - here.added(model, theta)
+    left = here.left(own)
+    if not len(left) or _part(left, course) <= ANEW:
+        return False
+    left, course = left - left.mean(axis=0), course - course.mean(axis=0)
+    part = _part(left, course)
+    variance = _variance(left - part * course, course, LEAST_PARTS)
+    return part > ANEW and part**2 * float(np.sum(course**2)) > SIGNIFICANT**2 * variance
+
+
+def _part(left: Array, course: Array) -> float:
+    """How much of a course (n, 3 S) there is in what is left, by least squares."""
+    power = float(np.sum(course**2))
+    return float(np.sum(left * course)) / power if power > 0 else 0.0

@@ -79,8 +79,13 @@ class Sought:
         return self.p < ALPHA and not self.of_the_log
 
 
-def sought(state: State, record: Record) -> Sought | None:
-    """Look for a waveform that the sensors share; None where there are too few sensors or samples to ask."""
+def sought(state: State, record: Record, *, may_follow: bool = False) -> Sought | None:
+    """Look for a waveform that the sensors share; None where there are too few sensors or samples to ask.
+
+    Parameters
+    ----------
+    may_follow: whether the waveform may resemble a logged channel, one that was tried and does not explain it.
+    """
     residual = state.residual
     if residual.across is None:
         return None
@@ -114,7 +119,7 @@ def sought(state: State, record: Record) -> Sought | None:
         objection = "it is less than 5 % of what is adopted, whose laws may leave it"
     elif not gain.consistent:
         objection = "the sensors do not predict each other with it on held-out stretches"
-    elif like is not None:
+    elif like is not None and not may_follow:
         objection = f"its waveform follows channel {like[0]}"
     elif left_by := effect_along(state, basis, seen):
         objection = f"the sensors feel it as they feel {left_by}, which may leave it"

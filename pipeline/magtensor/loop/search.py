@@ -101,7 +101,7 @@ def search(
         instead = None
         if source is None and shared.left_by:
             instead = shared.left_by
-            source = _source_instead(hidden, record, state, instead, how, len(declared), alpha)
+            source = _source_instead(hidden, record, state, shared, how, len(declared), alpha)
         if source is None:
             break
         if say is not None:
@@ -150,15 +150,22 @@ def _exchanged(
 
 
 def _source_instead(
-    component: Component, record: Record, state: State, name: str, how: Fitting, fixed: int, alpha: float
+    component: Component, record: Record, state: State, left: Sought, how: Fitting, fixed: int, alpha: float
 ) -> Source | None:
-    """A source nobody logged in the place of an adopted effect that has the same vectors at the sensors: of something
-    that switches now and then a single step is a part. None where it does not do better."""
-    places = [i for i, a in enumerate(state.adopted) if a.name == name and i >= fixed]
+    """A source nobody logged in the place of the adopted effect that has the same vectors at the sensors: of something
+    that switches now and then a single step is a part, and so is what channels show that feel it late. None where it
+    does not do better.
+
+    Parameters
+    ----------
+    left: what the effect leaves.
+    """
+    places = [i for i, a in enumerate(state.adopted) if a.name == left.left_by and i >= fixed]
     if not places:
         return None
     less = without_models(record, state, places, how)
-    shared = sought(less, record)
+    tried = left.significant and all(generic(state.adopted[i]) for i in places)
+    shared = sought(less, record, may_follow=tried)
     source = None if shared is None else tried_source(component, record, less, shared, how, alpha)[1]
     if source is None or source.after.fit.keep.sum() < state.fit.keep.sum():
         return None

@@ -12,7 +12,7 @@ import numpy as np
 
 from magtensor.calibration.types import Array, ArrayCalibration
 from magtensor.errors import DataError, UsageError
-from magtensor.loop.another_survey import TONE, shows_a_state
+from magtensor.loop.another_survey import TONE, begins_anew, shows_a_state
 from magtensor.loop.correction import corrected_raw, corrected_reference
 from magtensor.loop.model import Adopted, Record
 from magtensor.loop.needs import FACTS
@@ -73,14 +73,36 @@ def stored_effects(calibration: Survey, registry: Registry) -> tuple[list[Adopte
     return adopted, theta, means
 
 
-def on_its_clock(adopted: Sequence[Adopted], calibration: Survey, survey: Survey) -> list[Adopted]:
+def on_its_clock(
+    adopted: Sequence[Adopted],
+    theta: Sequence[Array],
+    means: Mapping[str, Array],
+    calibration: Survey,
+    fitted: ArrayCalibration,
+    survey: Survey,
+) -> list[Adopted]:
     """Effects of a calibration as they are on another survey: what happened at a time has happened since then.
 
-    A jump stays, and a drift holds its last value. Warming up begins anew with every survey, and what a lagged response
-    began with is another survey's own.
+    A jump stays, and a drift holds its last value, unless the survey's own outputs show that it begins anew. Warming up
+    does with every survey, and what a lagged response began with is another survey's own.
     """
     begun = calibration["calibration/effects"].attrs.get("start") if adopted else None
-    return list(adopted) if begun is None else begun_with(adopted, datetime.fromisoformat(str(begun)), survey)
+    if begun is None:
+        return list(adopted)
+    known = begun_with(adopted, datetime.fromisoformat(str(begun)), survey)
+    dated = [i for i, a in enumerate(known) if a.start is not None and a.component.effect == "instrument"]
+    if not dated:
+        return known
+    record = record_of(survey, means=means, every=True)
+    own = [i for i, a in enumerate(known) if a.component.effect == "instrument" and not _lacking(a, record)]
+    effects = [(known[i], theta[i]) for i in own]
+    anew = {i for i in dated if i in own and begins_anew(record, fitted, effects, own.index(i))}
+    return [replace(a, start=None) if i in anew else a for i, a in enumerate(known)]
+
+
+def begins_again(adopted: Sequence[Adopted]) -> str:
+    """Which effects that go with time go with this survey's own; "" where none does."""
+    return ", ".join(dict.fromkeys(a.name for a in adopted if _of_a_time(a) and a.start is None))
 
 
 def begun_with(adopted: Sequence[Adopted], begun: datetime, survey: Survey) -> list[Adopted]:

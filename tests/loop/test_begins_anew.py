@@ -1,0 +1,78 @@
+"""What goes with time, on another survey: it goes on, as iron does, or begins anew, as electronics switched on do."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+from loop_cases import scenario, survey_file
+
+import magtensor
+from magtensor.closed_loop import ClosedLoop
+
+MOTION = scenario()["motion"] | {"duration_s": 600.0}
+DRIFT = {"type": "offset_drift", "rms_nT": 0.6}
+FADING = {"type": "scale_drift", "rms_nT": 0.6}
+STEP = {"type": "offset_step", "time_s": [250.0], "nT": [[0.0] * 3, [0.6, -0.5, 0.8], [0.0] * 3, [0.0] * 3]}
+LATER = "2026-06-12T09:00:00Z"
+
+
+def of_a_day(seed: int, *effects: dict[str, Any], start: str | None = None) -> dict[str, Any]:
+    made = scenario(seed, *effects, motion=MOTION)
+    return made | ({} if start is None else {"start": start})
+
+
+def found(folder: Path, effect: dict[str, Any]) -> ClosedLoop:
+    done = magtensor.close_loop(survey_file(folder, of_a_day(5, effect)), search=[str(effect["type"])])
+    assert [a["error_model"] for a in done.verdict["adopted"]] == [effect["type"]]
+    return done
+
+
+@pytest.mark.parametrize("effect", [DRIFT, FADING, STEP], ids=lambda e: str(e["type"]))
+def test_another_day_begins_anew(tmp_path: Path, effect: dict[str, Any]) -> None:
+    done = found(tmp_path, effect)
+    same, later = (survey_file(tmp_path, of_a_day(6, effect, start=s), f"{s is None}.h5") for s in (None, LATER))
+    there = done.calibration.apply(later)
+    assert there["calibrated/b"].attrs["begins_anew"] == effect["type"]
+    there_again = done.calibration.apply(same)  # on the clock of the first survey the two are the same
+    np.testing.assert_allclose(there["calibrated/b"], there_again["calibrated/b"], atol=1e-3)
+
+
+def half(path: Path, second: bool) -> Path:
+    """One half of a survey's samples, on the clock of the whole."""
+    out = path.with_name(f"{'second' if second else 'first'}_{path.name}")
+    with h5py.File(path) as whole, h5py.File(out, "w") as part:
+        n = len(whole["time"])
+        for name, data in whole.items():
+            if isinstance(data, h5py.Dataset):
+                values = data[()]
+                part[name] = values if len(values) != n else values[n // 2 :] if second else values[: n // 2]
+                if "units" in data.attrs:
+                    part[name].attrs["units"] = data.attrs["units"]
+        for name, data in whole["reference"].items():
+            part[f"reference/{name}"] = data[()]
+            part[f"reference/{name}"].attrs["units"] = data.attrs["units"]
+    return out
+
+
+def test_a_drift_that_goes_on_does_not_begin_anew(tmp_path: Path) -> None:
+    whole = survey_file(tmp_path, scenario(5, {"type": "offset_drift", "rms_nT": 1.2}), "whole.h5")
+    done = magtensor.close_loop(half(whole, second=False), search=["offset_drift"])
+    assert [a["error_model"] for a in done.verdict["adopted"]] == ["offset_drift"]
+    assert "begins_anew" not in done.calibration.apply(half(whole, second=True))["calibrated/b"].attrs
+
+
+@pytest.mark.parametrize("effect", [DRIFT, STEP], ids=lambda e: str(e["type"]))
+@pytest.mark.parametrize("seed", [6, 7])
+def test_what_stays_does_not_begin_anew(tmp_path: Path, effect: dict[str, Any], seed: int) -> None:
+    """On the other day the offsets are what they were at the end of the first, and a little besides."""
+    done = found(tmp_path, effect)
+    bare = survey_file(tmp_path, of_a_day(seed, start=LATER), "bare.h5")
+    with h5py.File(tmp_path / "survey.h5") as file:
+        last = file[f"truth/effect_00_{effect['type']}"][-1]
+    with h5py.File(bare, "r+") as file:
+        file["b_raw"][...] += last + 0.3 * np.random.default_rng(seed).standard_normal(last.shape)
+    assert "begins_anew" not in done.calibration.apply(bare)["calibrated/b"].attrs
