@@ -1,6 +1,6 @@
 """Built-in error models: the catalogue of docs/error_models.md."""
 
-from magtensor_effects.ageing import offset_drift, offset_step, scale_drift, scale_step, warm_up
+from magtensor_effects.ageing import offset_drift, offset_step, offset_while, scale_drift, scale_step, warm_up
 from magtensor_effects.channels import channel_response, moving_part, periodic_interference
 from magtensor_effects.geometry import baseline_expansion, finite_baseline, position_error
 from magtensor_effects.inertia import bandwidth, clock_drift, eddy_current, sampling_lag, viscous_magnetisation
@@ -31,6 +31,7 @@ __all__ = [
     "nonlinearity_quadratic",
     "offset_drift",
     "offset_step",
+    "offset_while",
     "passing_source",
     "periodic_interference",
     "position_error",

@@ -91,6 +91,31 @@ def offset_step(x: Excitation, *, time_s: EventTime = 0.0) -> Terms:
 
 @error_model(
     "instrument",
+    source="two jumps of opposite sign",
+    typical="13 000 nT from a small magnet at 3 cm; some nT from a tool or a telephone left on the platform",
+    pointwise=True,
+)
+def offset_while(
+    x: Excitation,
+    *,
+    time_s: Annotated[
+        float, EventTimes(20), Field(description="begin or end of the part, s since the survey's start")
+    ] = 0.0,
+    until_s: Annotated[
+        float, EventTimes(21), Field(description="the other one, s")
+    ] = 60.0,  # grids without a common time
+) -> Terms:
+    """Each axis's offset is another one between two times: a tool, a telephone or a magnet lay on the platform.
+
+    One coefficient an axis. Rivals: `offset_step` where one of the two times is near an end of the survey;
+    `latent_source` where it comes and goes more than once.
+    """
+    first, last = sorted((time_s, until_s))
+    return x.offsets(((x.elapsed >= first) & (x.elapsed < last)).astype(float), "nT")
+
+
+@error_model(
+    "instrument",
     source="diagonal part of a jump of C",
     typical="5 nT for 100 ppm: a range switched, a feedback resistor or reference voltage that has changed",
     pointwise=True,

@@ -16,7 +16,7 @@ from magtensor.loop.needs import missing
 from magtensor.loop.settings import Range
 from magtensor.registry import Registry
 
-# DESIGN section 5, without the base model `linear`.
+# DESIGN section 5, without the base model `linear`; its several steps of an offset are also one that goes back.
 CATALOGUE = {
     "instrument": {
         "temperature_offset", "temperature_scale", "temperature_rate", "offset_drift", "scale_drift", "warm_up",
@@ -24,7 +24,7 @@ CATALOGUE = {
         "cross_field", "hysteresis", "offset_step", "sampling_lag", "eddy_current", "bandwidth", "clock_drift",
         "crosstalk", "viscous_magnetisation", "moving_part", "periodic_interference", "frame_flexure",
         "channel_response", "finite_baseline", "position_error", "baseline_expansion", "latent_source",
-        "scale_step", "turn_step",
+        "scale_step", "turn_step", "offset_while",
     },
     "site": {"fixed_source", "site_gradient", "passing_source"},
     "reference": {"reference_scale", "reference_clock", "reference_drift", "reference_step"},

@@ -11,7 +11,7 @@ from __future__ import annotations
 import pickle
 from collections.abc import Callable, Mapping
 from difflib import get_close_matches
-from itertools import product
+from itertools import combinations, product
 from typing import Any
 
 import numpy as np
@@ -23,10 +23,11 @@ from magtensor.loop.example import example_survey
 from magtensor.loop.excitation import Excitation
 from magtensor.loop.model import Adopted, Record
 from magtensor.loop.needs import FACTS, missing
-from magtensor.loop.settings import AnyChannel, Choice, Range
+from magtensor.loop.settings import AnyChannel, Choice, EventTimes, Range, profiled
 from magtensor.loop.terms import REFERENCE, Terms
 
 TRIED = 24  # combinations of settings at most
+APART = 0.1  # of the survey, by which two times of one model differ: between them is more than a sample
 DEPENDENT = 1e-9  # singular value, relative, below which regressors are linearly dependent
 DISTORTION_NT = 0.1  # rms that the effect adds in the round trip: little enough beside the differences between sensors
 RECOVERED_NT = 1e-3  # what the round trip may leave
@@ -131,6 +132,8 @@ def _combinations(component: Component, x: Excitation) -> list[dict[str, Any]]:
     """The defaults, and combinations of the ends and the middle of each setting's grid."""
     grids = _grids(component, x)
     every = [dict(zip(grids, values, strict=True)) for values in product(*grids.values())]
+    times = [n for n, mark in profiled(component).items() if isinstance(mark, EventTimes)]
+    every = [c for c in every if all(abs(c[a] - c[b]) > APART * x.duration for a, b in combinations(times, 2))]
     step = max(1, len(every) // TRIED)
     defaults: list[dict[str, Any]] = [{}] if _only_one_channel_each(component, x) else []
     return defaults + every[::step]

@@ -12,9 +12,11 @@ from magtensor.loop.assessment import WHITE, Colours, block_count
 from magtensor.loop.evidence import Grams, grams
 from magtensor.loop.model import Fitting, Record, State, joint_state
 from magtensor.loop.residual import Residual, taken_off
+from magtensor.loop.settings import EventTimes, profiled
 from magtensor.loop.statistics import family_p, held_out_gain
 from magtensor.loop.terms import Terms
 from magtensor.loop.trial import WORST_RISE
+from magtensor.loop.waveform import NAME
 
 KEEP_ALPHA = 0.01  # an adopted effect that is no longer significant at this level is dropped
 
@@ -58,30 +60,47 @@ def put_back(residual: Residual, terms: Terms, theta: Array) -> Residual:
 def eliminate(record: Record, state: State, how: Fitting, fixed: int) -> tuple[State, tuple[str, ...]]:
     """Drop models that no longer earn their place, the weakest first: those whose coefficients are not what their
     settings assume, those that are not significant beside the others, and those without which the others predict
-    held-out blocks as well, or much better if all noise counts alike. A single one has just passed the gates."""
+    held-out blocks as well, or better if all noise counts alike. A single one has just passed the gates but for the
+    last: what raises the error on blocks that it has not seen is no effect, whatever noise it makes white."""
     dropped: list[str] = []
-    while len(state.adopted) > (fixed if dropped else max(fixed, 1)):
+    while len(state.adopted) > fixed:
         assert state.terms is not None
         blocks, freedom = _blocks(state), state.residual.freedom
         parts = slices(state)[fixed:]
         values = [family_p(blocks, state.terms.sensors, list(range(p.start, p.stop))) for p in parts]
         order = np.arange(state.terms.count)
         gains = [held_out_gain(blocks, freedom, (order < p.start) | (order >= p.stop)).total for p in parts]
-        rises = [after / before for before, after in (removal(state, fixed + i) for i in range(len(parts)))]
+        rises = [_rise(state, fixed + i) for i in range(len(parts))]
         unlike = [i for i in range(fixed, len(state.adopted)) if not agrees(state, i)]
-        if unlike:
+        if len(state.adopted) == 1 and not dropped:
+            if max(rises) <= 1.0:
+                break
+            weakest = 0
+        elif unlike:
             weakest = unlike[0]
         elif max(values) >= KEEP_ALPHA:
             weakest = fixed + int(np.argmax(values))
         elif min(gains) <= 0:
             weakest = fixed + int(np.argmin(gains))
-        elif max(rises) > 1.0 + WORST_RISE:
+        elif max(rises) > 1.0:
             weakest = fixed + int(np.argmax(rises))
         else:
             break
         dropped.append(state.adopted[weakest].name)
         state = without_models(record, state, [weakest], how)
     return state, tuple(dropped)
+
+
+def _rise(state: State, place: int) -> float:
+    """The factor by which an adopted model raises the error on held-out blocks.
+
+    Of what happened once the blocks where it did say little, and what holds a waveform has its noise: both may raise it
+    somewhat.
+    """
+    before, after = removal(state, place)
+    model = state.adopted[place]
+    once = any(isinstance(grid, EventTimes) for grid in profiled(model.component).values())
+    return after / before / (1.0 + WORST_RISE if once or model.name == NAME else 1.0)
 
 
 def agrees(state: State, place: int) -> bool:

@@ -363,9 +363,12 @@ def without(record: Record, each: Sequence[Terms], theta: Sequence[Array]) -> tu
 
 
 def excitation_of(record: Record, fit: JointFit, lines: Sequence[float] = ()) -> Excitation:
-    """Modelled outputs and field of every sample from the common field of a fit."""
+    """Modelled outputs and field of every sample from the common field of a fit, of the length that is known: the noise
+    in what is seen of it is what the total field's residual is made of, and models would find it there."""
     q = nearest_frame(fit.forward)
     b = fit.scalar.field(fit.plane.coordinates(record.raw)) if fit.posterior is None else fit.posterior.field
+    if record.total_field is not None:
+        b = b * (record.total_field / np.linalg.norm(b, axis=1))[:, None]
     output = by_sensor(fit.forward, b) + fit.offset
     common = np.repeat((b @ q)[:, None], len(record.sensors), axis=1)
     return record.excitation(output, common, lines, matrix=fit.forward @ q)

@@ -183,7 +183,9 @@ def residual_of(fit: JointFit, raw: Array, total_field: Array | None, reference_
     g = u @ scalar.matrix
     spread = np.sqrt(np.einsum("ni,ni->n", g, g) + reference_noise**2)
     unit = float(length.mean())
-    affine = np.column_stack([b / unit, np.ones(len(b))])
+    # of the length that is known: its noise along u is the residual itself, and what knows u otherwise would tell it
+    known = length if total_field is None else total_field[keep]
+    affine = np.column_stack([u * (known / unit)[:, None], np.ones(len(b))])
     across = plane.residual(used) if size > 3 else None
     along = None if total_field is None else (length - total_field[keep]) / spread
     if fit.posterior is not None:

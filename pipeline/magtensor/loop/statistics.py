@@ -44,6 +44,18 @@ class Estimate:
         return out
 
 
+def symmetric_eigen(m: Array) -> tuple[Array, Array]:
+    """Eigenvalues and vectors of symmetric matrices (..., P, P).
+
+    LAPACK may give up on a matrix that lacks nothing; it does not when it reads the other triangle.
+    """
+    try:
+        values, vectors = np.linalg.eigh(m)
+    except np.linalg.LinAlgError:
+        values, vectors = np.linalg.eigh(m, UPLO="U")
+    return values, vectors
+
+
 def solve(n: Array, y: Array, scale: Array) -> Estimate:
     """Least squares in the identifiable directions of one normal matrix.
 
@@ -60,7 +72,7 @@ def solve(n: Array, y: Array, scale: Array) -> Estimate:
 def _directions(n: Array, scale: Array) -> tuple[Array, Array]:
     """Identifiable directions (P, p) and their information (p,), in scaled coordinates undone again."""
     root = np.sqrt(np.maximum(scale, 1e-300))
-    values, vectors = np.linalg.eigh(n / np.outer(root, root))
+    values, vectors = symmetric_eigen(n / np.outer(root, root))
     seen = values > IDENTIFIABLE
     return vectors[:, seen] / root[:, None], values[seen]
 
@@ -92,7 +104,7 @@ def explained_by_each(g: Grams) -> tuple[Array, NDArray[np.int_]]:
     many directions are identifiable."""
     n, y = normal(g)
     root = np.sqrt(np.maximum(own_information_of_each(g), 1e-300))
-    values, vectors = np.linalg.eigh(n / (root[:, :, None] * root[:, None, :]))
+    values, vectors = symmetric_eigen(n / (root[:, :, None] * root[:, None, :]))
     seen = values > IDENTIFIABLE
     shown = (vectors.swapaxes(1, 2) @ (y / root)[:, :, None])[:, :, 0]
     return np.sum(np.where(seen, shown**2 / np.where(seen, values, 1.0), 0.0), axis=1), seen.sum(axis=1)
@@ -175,7 +187,7 @@ def _confirmed(basis: Array, n: Array) -> Array:
     basis: (P, p).
     n: (B, P, P), the information without each block.
     """
-    values, vectors = np.linalg.eigh(basis.T @ n @ basis)
+    values, vectors = symmetric_eigen(basis.T @ n @ basis)
     lost = vectors.transpose(0, 2, 1)[values < LEAST_LEFT]
     if not len(lost):
         return basis
