@@ -224,6 +224,8 @@ def test_what_follows_a_channel_is_not_blamed_on_a_hidden_source() -> None:
     logged = {"pump": WAVE + 0.2 * np.random.default_rng(5).standard_normal(N)}
     known = replace(record, logged=logged, means={"pump": np.zeros(())}, units={"pump": "A"})
     assert "pump" in objection(known)
+    tried = sought(linear_state(known), known, may_follow=True)  # the channel was adopted, and leaves much of it
+    assert tried is not None and tried.significant and not tried.objection
 
 
 @pytest.mark.parametrize("rank", [1, 3])

@@ -15,7 +15,7 @@ from magtensor.loop.assessment import WHITE, colours_of, estimated, likeliest
 from magtensor.loop.beginnings import begun
 from magtensor.loop.excitation import Excitation
 from magtensor.loop.golden import REFINEMENTS, golden
-from magtensor.loop.model import State, regressors
+from magtensor.loop.model import Adopted, State, regressors
 from magtensor.loop.multiplicity import alike, effective_tests, projected
 from magtensor.loop.residual import Residual
 from magtensor.loop.scoring import Scorer
@@ -57,7 +57,7 @@ def settings_grid(model: Component, x: Excitation) -> list[dict[str, Any]]:
     return combinations
 
 
-def _already(state: State, model: Component, settings: Mapping[str, Any]) -> bool:
+def already(adopted: Iterable[Adopted], model: Component, settings: Mapping[str, Any]) -> bool:
     """Whether a model is in already with the same channel, and settings on ranges so near that the two could not be
     told apart."""
     grids = profiled(model)
@@ -65,10 +65,10 @@ def _already(state: State, model: Component, settings: Mapping[str, Any]) -> boo
     ranges = {n for n, g in grids.items() if _of_ratios(g)}
     same = channels or set(grids) - ranges
     return any(
-        all(adopted.settings.get(n) == settings.get(n) for n in same)
-        and not any(_apart(adopted.settings[n], settings[n]) for n in ranges)
-        for adopted in state.adopted
-        if adopted.name == model.name
+        all(one.settings.get(n) == settings.get(n) for n in same)
+        and not any(_apart(one.settings[n], settings[n]) for n in ranges)
+        for one in adopted
+        if one.name == model.name
     )
 
 
@@ -139,7 +139,7 @@ def best_settings(
     In white noise what is slow decides, in coloured noise what is fast. Beside each the number of independent tests
     that all settings amount to.
     """
-    grid = [g for g in settings_grid(model, state.excitation) if not _already(state, model, g)]
+    grid = [g for g in settings_grid(model, state.excitation) if not already(state.adopted, model, g)]
     if len(grid) == 1:
         return [(grid[0], 1.0)]
     scores: list[tuple[float, float, dict[str, Any]]] = []

@@ -22,10 +22,11 @@ from magtensor.loop.excitation import Excitation
 from magtensor.loop.found import Search, Step
 from magtensor.loop.gates import ALPHA, OF_THE_LAW, SECOND_ORDER, Candidate
 from magtensor.loop.latent import NAME, Sought, Source, renewed, sought, tried_source
+from magtensor.loop.log_noise import channels_of
 from magtensor.loop.model import Adopted, Fitting, Record, State, joint_state
 from magtensor.loop.needs import missing
 from magtensor.loop.overshadowed import overshadowed
-from magtensor.loop.profiling import repeatable
+from magtensor.loop.profiling import already, repeatable
 from magtensor.loop.screening import candidates_of, generic
 from magtensor.loop.separation import SEPARATION, fold_gain, separated
 from magtensor.loop.settings import AnyChannel, EventTimes, profiled
@@ -242,15 +243,18 @@ def _kept(record: Record, before: Trial, chosen: Candidate, how: Fitting) -> tup
         return None, f"fitted, it raises the held-out error of {', '.join(hurt)}"
     which = len(before.state.adopted)
     model = after.state.adopted[which]
+    acts_on = model.sensors or tuple(record.sensors)
+    same = [a for a in after.state.adopted[:which] if set(a.sensors or record.sensors) & set(acts_on)]
+    if not channels_of(model, after.state.excitation) and already(same, model.component, model.settings):
+        return None, "fitted, its settings are those of what is adopted already"
     if not agrees(after.state, which):
         return None, "fitted, its coefficients are not what its settings assume"
     if not before.likelier(after):
         return None, "fitted together with the others, it leaves more than it takes away"
     if any(isinstance(grid, EventTimes) for grid in profiled(model.component).values()):
-        own = model.sensors or tuple(record.sensors)
-        terms = chosen.terms.only(i for i, s in enumerate(chosen.terms.sensors) if s in own)
+        terms = chosen.terms.only(i for i, s in enumerate(chosen.terms.sensors) if s in acts_on)
         if channel := channel_instead(before.state, terms, chosen.assessment.colours):
-            why = f"C of {', '.join(own)} follows {channel}, which explains more than something that happens once"
+            why = f"C of {', '.join(acts_on)} follows {channel}, which explains more than something that happens once"
             return None, why
     return after, ""
 

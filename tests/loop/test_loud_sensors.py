@@ -1,0 +1,64 @@
+"""Sensors whose noise is a per cent of the field, as in a telephone: no regressor may hold the noise it explains."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from loop_cases import linear_state, scenario, synthetic, verdict_of
+
+from magtensor.loop.contribution import eliminate, removal
+from magtensor.loop.model import Adopted, Fitting, joint_state
+from magtensor.loop.statistics import symmetric_eigen
+from magtensor.registry import Registry
+
+OF_THE_FIELD = ["hysteresis", "bandwidth", "viscous_magnetisation", "nonlinearity_cubic", "scale_step", "cross_field"]
+
+
+@pytest.mark.parametrize(("sensors", "noise_nT"), [(1, 700.0), (1, 150.0), (3, 700.0)])
+def test_clean_ones_are_not_accused(tmp_path: Path, sensors: int, noise_nT: float) -> None:
+    """Quick turns between rests, 20 Hz: in the rests a play operator knows the noise best."""
+    survey = scenario(21, rate_Hz=20.0)
+    places = [[0.2, 0.0, 0.0], [-0.1, 0.2, 0.0], [-0.1, -0.2, 0.0]][:sensors]
+    noise = {"white_sd_nT": noise_nT, "flicker_nT_per_rtHz": 0.0}
+    survey["instrument"] = survey["instrument"] | {"array": {"positions_m": places}, "noise": noise}
+    survey["motion"] = survey["motion"] | {"duration_s": 240.0, "rate_rms_deg_s": 30.0}
+    told = verdict_of(tmp_path, survey, models=OF_THE_FIELD)
+    assert told["adopted"] == []
+    assert not told["unexplained"]["present"], told["unexplained"]
+
+
+def test_models_see_the_field_at_the_length_that_is_known() -> None:
+    record = synthetic(3, sensors=1, noise_nT=500.0)
+    state = linear_state(record)
+    assert record.total_field is not None
+    np.testing.assert_allclose(np.linalg.norm(state.excitation.field[:, 0], axis=1), record.total_field, rtol=1e-12)
+
+
+def test_a_single_model_that_raises_the_error_on_blocks_is_dropped() -> None:
+    """A random channel in white noise: its twelve coefficients are fitted to noise."""
+    clean = synthetic(4)
+    pump = np.random.default_rng(8).standard_normal(len(clean.time))
+    record = type(clean)(**{**vars(clean), "logged": {"pump": pump}, "units": {"pump": "A"}})
+    model = Adopted(Registry.load().find("error_model", "channel_response"), {"channel": "pump"})
+    state = joint_state(record, [model], Fitting())
+    before, after = removal(state, 0)
+    last, dropped = eliminate(record, state, Fitting(), 0)
+    assert (dropped == ("channel_response",)) == (after > before)
+    assert after > before and last.adopted == ()
+
+
+def test_a_matrix_that_lapack_gives_up_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    real = np.linalg.eigh
+
+    def eigh(m: np.ndarray, UPLO: str = "L") -> object:
+        if UPLO == "L":
+            raise np.linalg.LinAlgError("Eigenvalues did not converge")
+        return real(m, UPLO)
+
+    half = np.random.default_rng(1).standard_normal((5, 4, 4))
+    matrices = half @ half.transpose(0, 2, 1)
+    expected = real(matrices)[0]
+    monkeypatch.setattr(np.linalg, "eigh", eigh)
+    np.testing.assert_allclose(symmetric_eigen(matrices)[0], expected)
