@@ -440,6 +440,16 @@ def test_lags_run_on_through_gaps() -> None:
     assert fitted("viscous_magnetisation", {"tau_s": 20.0}, viscous, POSTURES)[0].left < 0.1
 
 
+def test_an_offset_for_a_while_is_two_jumps() -> None:
+    begin, end = (simulated("offset_step", TUMBLING, nT=drawn(5), time_s=[at]) for at in (60.0, 110.0))
+    x = excitation(begin)
+    terms = model("offset_while").function(x, time_s=110.0, until_s=60.0)
+    added = begin.truth.effects[0].added - end.truth.effects[0].added
+    fit = explained(terms, x, added)
+    assert fit.left < 1e-6
+    np.testing.assert_allclose(per_axis(fit, begin.sensors), truth_of(begin), atol=0.05)
+
+
 def test_every_model_is_held_to_the_simulator_here() -> None:
     import inspect
     import sys

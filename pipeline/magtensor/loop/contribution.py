@@ -10,7 +10,7 @@ import numpy as np
 from magtensor.calibration.types import Array
 from magtensor.loop.assessment import WHITE, Colours, block_count
 from magtensor.loop.evidence import Grams, grams
-from magtensor.loop.model import Fitting, Record, State, joint_state
+from magtensor.loop.model import Adopted, Fitting, Record, State, joint_state
 from magtensor.loop.residual import Residual, taken_off
 from magtensor.loop.settings import EventTimes, profiled
 from magtensor.loop.statistics import family_p, held_out_gain
@@ -73,7 +73,7 @@ def eliminate(record: Record, state: State, how: Fitting, fixed: int) -> tuple[S
         rises = [_rise(state, fixed + i) for i in range(len(parts))]
         unlike = [i for i in range(fixed, len(state.adopted)) if not agrees(state, i)]
         if len(state.adopted) == 1 and not dropped:
-            if max(rises) <= 1.0:
+            if rises[0] <= 1.0 or not _lasts(state.adopted[0]):
                 break
             weakest = 0
         elif unlike:
@@ -98,9 +98,12 @@ def _rise(state: State, place: int) -> float:
     somewhat.
     """
     before, after = removal(state, place)
-    model = state.adopted[place]
-    once = any(isinstance(grid, EventTimes) for grid in profiled(model.component).values())
-    return after / before / (1.0 + WORST_RISE if once or model.name == NAME else 1.0)
+    return after / before / (1.0 if _lasts(state.adopted[place]) else 1.0 + WORST_RISE)
+
+
+def _lasts(model: Adopted) -> bool:
+    """Whether a model is neither of what happened once nor of a waveform found in the data."""
+    return model.name != NAME and not any(isinstance(g, EventTimes) for g in profiled(model.component).values())
 
 
 def agrees(state: State, place: int) -> bool:
