@@ -171,7 +171,7 @@ def apply_and_refine(
     from magtensor.calibration.surveys.corrections import with_scatter
     from magtensor.dated import at_date_of
     from magtensor.effect_errors import taken_off
-    from magtensor.loop.stored import begins_again, cleaned, extrapolated, left_in, on_its_clock, stored_effects
+    from magtensor.loop.stored import begun_anew, cleaned, extrapolated, left_in, on_its_clock, stored_effects
     from magtensor.offsets_apart import scatter_for, without_scatter
     from magtensor.platform_frame import as_fitted, with_refined_rotation
     from magtensor.standing_out import flagged
@@ -197,7 +197,7 @@ def apply_and_refine(
         words = {
             "not_taken_off": left_in(survey, adopted),
             "extrapolated": extrapolated(before, calibration, adopted, means),
-            "begins_anew": begins_again(adopted),
+            "begins_anew": begun_anew(adopted, calibration),
         }
         survey = survey.merged(_named(corrected(fitted, survey, **words), calibration, dated, apart))
         if refine_rotation:

@@ -76,3 +76,20 @@ def test_what_stays_does_not_begin_anew(tmp_path: Path, effect: dict[str, Any], 
     with h5py.File(bare, "r+") as file:
         file["b_raw"][...] += last + 0.3 * np.random.default_rng(seed).standard_normal(last.shape)
     assert "begins_anew" not in done.calibration.apply(bare)["calibrated/b"].attrs
+
+
+def test_beside_a_source_that_nobody_logged(tmp_path: Path) -> None:
+    """The source's waveform on the other day is found without the drift, which has to be known before."""
+    vectors = [[2.7, -1.2, 1.8], [-1.5, 2.4, 0.3], [0.6, 1.5, -2.7], [2.1, -1.8, 0.9]]
+    waveform = {"type": "switched", "levels": [-1.0, 1.0], "mean_hold_s": 40.0}
+    source = {"type": "latent_source", "nT_per_unit": vectors, "waveform_of": waveform}
+    first, later = (
+        survey_file(tmp_path, of_a_day(seed, DRIFT, source, start=start), f"{seed}.h5")
+        for seed, start in ((5, None), (6, LATER))
+    )
+    done = magtensor.close_loop(first, search=["offset_drift", "latent_source"])
+    assert {a["error_model"] for a in done.verdict["adopted"]} == {"offset_drift", "latent_source"}
+    there = done.calibration.apply(later)
+    with h5py.File(later) as file:
+        error = np.linalg.norm(there["calibrated/b"], axis=2) - file["truth/total_field_true"][()][:, None]
+    assert np.sqrt(np.mean(error**2)) < 0.3  # twice the noise; the source moves |b| by 1.7 nT, the drift by 0.6

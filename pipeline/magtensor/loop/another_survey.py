@@ -22,7 +22,7 @@ from magtensor.tensor.geometry import array_design
 
 TONE = "periodic_interference"
 LEAST_CONTRAST = 1e-4  # of an effect's own power, between the sensors
-SIGNIFICANT = 4.0  # standard deviations of what a lagged response began with
+SIGNIFICANT = 4.0  # standard deviations, of what is found on another survey
 LEAST_PARTS = 8  # of the survey, whose means tell how large slow noise is
 ANEW = 0.5  # of the difference between beginning anew and going on
 

@@ -62,6 +62,10 @@ def eliminate(record: Record, state: State, how: Fitting, fixed: int) -> tuple[S
     settings assume, those that are not significant beside the others, and those without which the others predict
     held-out blocks as well, or better if all noise counts alike. A single one has just passed the gates but for the
     last: what raises the error on blocks that it has not seen is no effect, whatever noise it makes white."""
+    if len(state.adopted) == 1:
+        if fixed or not _lasts(state.adopted[0]) or _rise(state, 0) <= 1.0:
+            return state, ()
+        return without_models(record, state, [0], how), (state.adopted[0].name,)
     dropped: list[str] = []
     while len(state.adopted) > fixed:
         assert state.terms is not None
@@ -72,11 +76,7 @@ def eliminate(record: Record, state: State, how: Fitting, fixed: int) -> tuple[S
         gains = [held_out_gain(blocks, freedom, (order < p.start) | (order >= p.stop)).total for p in parts]
         rises = [_rise(state, fixed + i) for i in range(len(parts))]
         unlike = [i for i in range(fixed, len(state.adopted)) if not agrees(state, i)]
-        if len(state.adopted) == 1 and not dropped:
-            if rises[0] <= 1.0 or not _lasts(state.adopted[0]):
-                break
-            weakest = 0
-        elif unlike:
+        if unlike:
             weakest = unlike[0]
         elif max(values) >= KEEP_ALPHA:
             weakest = fixed + int(np.argmax(values))

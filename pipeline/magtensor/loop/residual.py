@@ -23,7 +23,6 @@ from magtensor.calibration.types import Array
 from magtensor.loop.terms import Terms
 from magtensor.loop.turned import SlowModes
 
-NEIGHBOURS = 4  # samples on each side
 _INNER_RANK = 1e-9  # of the largest singular value
 
 
@@ -185,16 +184,15 @@ def residual_of(fit: JointFit, raw: Array, total_field: Array | None, reference_
     spread = np.sqrt(np.einsum("ni,ni->n", g, g) + reference_noise**2)
     unit = float(length.mean())
     affine = np.column_stack([b / unit, np.ones(len(b))])
-    known = affine
-    if total_field is not None:  # a sample's own noise along u is the residual itself: its neighbours tell the length
-        excess = _of_neighbours(length - total_field[keep])
-        known = np.column_stack([u * ((total_field[keep] + excess) / unit)[:, None], affine[:, 3]])
+    seen_along = affine
+    if total_field is not None:  # of the length that is known: a sample's own noise along u is the residual itself
+        seen_along = np.column_stack([u * (total_field[keep] / unit)[:, None], affine[:, 3]])
     across = plane.residual(used) if size > 3 else None
     along = None if total_field is None else (length - total_field[keep]) / spread
     if fit.posterior is not None:
         # the prior holds C and o where the residual is not the least there is
         affine[:, :3] = fit.posterior.field[keep] / unit
-        known = affine
+        seen_along = affine
         inner = np.einsum("ni,nj->nij", g / spread[:, None], affine).reshape(len(b), 12)
         along = None if along is None else least(along[:, None], inner)[:, 0]
         across = None if across is None else least(across, affine)
@@ -203,23 +201,13 @@ def residual_of(fit: JointFit, raw: Array, total_field: Array | None, reference_
         along=along,
         unit=unit,
         affine=affine,
-        inner=np.einsum("ni,nj->nij", g / spread[:, None], known).reshape(len(b), 12),
+        inner=np.einsum("ni,nj->nij", g / spread[:, None], seen_along).reshape(len(b), 12),
         basis=plane.basis,
         reference_gain=-1.0 / spread,
         noise=plane.noise,
         samples=keep,
         slow_modes=SlowModes(g / spread[:, None]),
     )
-
-
-def _of_neighbours(values: Array) -> Array:
-    """(N,) means of the samples before and after each, without its own."""
-    window = np.ones(2 * NEIGHBOURS + 1)
-    window[NEIGHBOURS] = 0.0
-    if len(values) < len(window):
-        return np.zeros_like(values)
-    out: Array = np.convolve(values, window, mode="same") / np.convolve(np.ones_like(values), window, mode="same")
-    return out
 
 
 def _direction(field: Array) -> Array:

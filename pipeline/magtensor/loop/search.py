@@ -230,9 +230,8 @@ def _kept(record: Record, before: Trial, chosen: Candidate, how: Fitting) -> tup
     except DataError as error:  # with coefficients that run away nothing is left to calibrate
         return None, f"it cannot be fitted: {error.what.split(':')[0]}"
     before = on_the_folds_of(after, record, before, how)
-    hurt = before.hurt_by(after)
+    hurt, which = before.hurt_by(after), len(before.state.adopted)
     if hurt:
-        which = len(before.state.adopted)
         own = after.state.adopted[which].sensors or tuple(record.sensors)
         helped = [s for s in before.helped_by(after) if s in own]
         if helped and set(chosen.terms.sensors) >= set(own):
@@ -241,7 +240,6 @@ def _kept(record: Record, before: Trial, chosen: Candidate, how: Fitting) -> tup
             hurt = before.hurt_by(after)
     if hurt:
         return None, f"fitted, it raises the held-out error of {', '.join(hurt)}"
-    which = len(before.state.adopted)
     model = after.state.adopted[which]
     acts_on = model.sensors or tuple(record.sensors)
     same = [a for a in after.state.adopted[:which] if set(a.sensors or record.sensors) & set(acts_on)]

@@ -95,13 +95,16 @@ def on_its_clock(
         return known
     record = record_of(survey, means=means, every=True)
     own = [i for i, a in enumerate(known) if a.component.effect == "instrument" and not _lacking(a, record)]
+    own = [i for i in own if known[i].name != NAME]  # its waveform here is found when the others are taken off
     effects = [(known[i], theta[i]) for i in own]
     anew = {i for i in dated if i in own and begins_anew(record, fitted, effects, own.index(i))}
     return [replace(a, start=None) if i in anew else a for i, a in enumerate(known)]
 
 
-def begins_again(adopted: Sequence[Adopted]) -> str:
-    """Which effects that go with time go with this survey's own; "" where none does."""
+def begun_anew(adopted: Sequence[Adopted], calibration: Survey) -> str:
+    """Which effects that go with time go with another survey's own, not the calibration's; "" where none does."""
+    if not adopted or "start" not in calibration["calibration/effects"].attrs:  # nothing says when that was
+        return ""
     return ", ".join(dict.fromkeys(a.name for a in adopted if _of_a_time(a) and a.start is None))
 
 
