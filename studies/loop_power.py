@@ -68,6 +68,7 @@ RIGHT: dict[str, dict[str, Any]] = {
     "supply_offset": {"channel": "supply_voltage"},
     "hysteresis": {"half_width_nT": 4000.0},
     "offset_step": {"time_s": 800.0},
+    "offset_while": {"time_s": 600.0, "until_s": 1000.0},
     "scale_step": {"time_s": 1000.0},
     "turn_step": {"time_s": 1000.0},
     "sampling_lag": {"per_axis": True},

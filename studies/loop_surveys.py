@@ -7,6 +7,8 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from magtensor.loop.model import Record
 from magtensor.loop.record import record_of
 from magtensor.preparing import empty_survey
@@ -66,6 +68,7 @@ EFFECTS: dict[str, dict[str, Any]] = {
     "cross_field": {},
     "hysteresis": {"half_width_nT": [4000.0]},
     "offset_step": {"time_s": [800.0]},
+    "offset_while": {"time_s": [600.0, 1000.0]},
     "scale_step": {"time_s": [1000.0], "sensors": ["S2"]},
     "turn_step": {"time_s": 1000.0, "sensors": ["S2"]},
     "sampling_lag": {"per_axis": True},
@@ -87,7 +90,15 @@ EFFECTS: dict[str, dict[str, Any]] = {
     "passing_source": {"time_s": 900.0, "closest_m": [12.0, 0.0, 0.0], "velocity_m_s": [0.0, 0.5, 0.0]},
 }
 FAMILIES = (
-    ("temperature_offset", "temperature_rate", "offset_drift", "warm_up", "supply_offset", "offset_step"),
+    (
+        "temperature_offset",
+        "temperature_rate",
+        "offset_drift",
+        "warm_up",
+        "supply_offset",
+        "offset_step",
+        "offset_while",
+    ),
     ("temperature_scale", "scale_drift", "supply_scale", "scale_step", "turn_step"),
     ("nonlinearity_quadratic", "nonlinearity_cubic", "cross_field"),
     ("hysteresis", "sampling_lag", "eddy_current", "bandwidth", "clock_drift", "viscous_magnetisation"),
@@ -98,6 +109,7 @@ FAMILIES = (
 STAGES = "title: study\nstages: [load, {detrend_diurnal: {uncovered: mask, despike: 8}}]\n"
 
 WHITE_NT: float = BASE["instrument"]["noise"]["white_sd_nT"]
+SENSORS = 4  # of the cross
 
 
 def scenario(motion: str, flicker: float, seed: int, effect: str = "", amplitude: float = 0.0) -> dict[str, Any]:
@@ -106,9 +118,20 @@ def scenario(motion: str, flicker: float, seed: int, effect: str = "", amplitude
     made = copy.deepcopy(BASE) | {"motion": MOTIONS[motion], "seed": seed, "truth": False}
     made["instrument"]["seed"] = 40 + seed
     made["instrument"]["noise"]["flicker_nT_per_rtHz"] = flicker
-    if effect:
-        made["effects"] = [{"type": e, "rms_nT": amplitude * WHITE_NT} | EFFECTS[e] for e in effect.split("+")]
+    made["effects"] = [one for e in effect.split("+") if e for one in _described(e, amplitude * WHITE_NT, seed)]
     return made
+
+
+def _described(effect: str, rms: float, seed: int) -> list[dict[str, Any]]:
+    """An effect of some rms (nT) for the simulator; an offset for a while is two jumps of opposite sign."""
+    if effect != "offset_while":
+        return [{"type": effect, "rms_nT": rms} | EFFECTS[effect]]
+    first, last = EFFECTS[effect]["time_s"]
+    duration = MOTIONS["tumbling"]["duration_s"]
+    jumps = np.random.default_rng(seed).standard_normal((SENSORS, 3))
+    jumps *= rms / np.sqrt(np.mean(jumps**2) * (last - first) / duration)
+    both = ((first, jumps), (last, -jumps))
+    return [{"type": "offset_step", "nT": nT.tolist(), "time_s": [at]} for at, nT in both]
 
 
 def recorded(simulation: Simulated) -> Record:

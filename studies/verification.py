@@ -60,14 +60,16 @@ def written(trial: Trial, folder: Path) -> tuple[Path, Path]:
     first = scenario(trial.motion, NOISES[NOISE], trial.seed, trial.effect, trial.amplitude)
     first["effects"] = [effect | AT_REST.get(trial.effect, {}) for effect in first["effects"]]
     made = simulate(first)
-    truth = made.truth.effects[0]
     second = copy.deepcopy(scenario(trial.motion, NOISES[NOISE], trial.seed + 1))
     second["instrument"]["seed"] = first["instrument"]["seed"]
-    if truth.kind == "instrument":
-        known = {key: value for key, value in first["effects"][0].items() if key != "rms_nT"}
+    second["effects"] = []
+    for described, truth in zip(first["effects"], made.truth.effects, strict=True):
+        if truth.kind != "instrument":
+            continue
+        known = {key: value for key, value in described.items() if key != "rms_nT"}
         if trial.effect == "channel_response":  # its square is about the mean of the survey that it was found in
             known["reference"] = float(recorded(made).means[known["channel"]])
-        second["effects"] = [known | truth.coefficients]
+        second["effects"].append(known | truth.coefficients)
     write(made, folder / "first.h5")
     write(simulate(second), folder / "second.h5")
     return folder / "first.h5", folder / "second.h5"

@@ -86,6 +86,7 @@ def sought(state: State, record: Record, *, may_follow: bool = False) -> Sought 
     ----------
     may_follow: whether the waveform may resemble a logged channel, one that was tried and does not explain it.
     """
+    state = state.unabridged
     residual = state.residual
     if residual.across is None:
         return None
@@ -213,14 +214,15 @@ def _told_from_the_field(residual: Residual, held: Array, direction: Array) -> C
 
 def renewed(record: Record, state: State, how: Fitting) -> tuple[Record, State]:
     """The waveform once more, from a calibration that knows the source or another effect better, and a refit."""
-    found = _put_back(state)
+    every = state.unabridged
+    found = _put_back(every)
     if found is None:
         return record, state
     across, direction = found
-    course = _course_beside_the_field(across, np.eye(len(direction)) - state.residual.projector, direction, state)
+    course = _course_beside_the_field(across, np.eye(len(direction)) - every.residual.projector, direction, every)
     if course.rms == 0:
         return record, state
-    waveform = np.interp(record.time, record.time[state.residual.samples], course.values / course.rms)
+    waveform = np.interp(record.time, record.time[every.residual.samples], course.values / course.rms)
     record = replace(record, waveform=waveform)
     return record, joint_state(record, state.adopted, how, state.theta, state.lines)
 

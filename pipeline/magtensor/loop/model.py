@@ -20,7 +20,7 @@ from magtensor.components import Component
 from magtensor.errors import NotEnoughData, UsageError
 from magtensor.loop.assessment import Colours, colours_of, estimated, log_likelihood
 from magtensor.loop.excitation import Excitation
-from magtensor.loop.residual import Residual, residual_of, taken_off
+from magtensor.loop.residual import Residual, quick, residual_of, taken_off
 from magtensor.loop.station import Station
 from magtensor.loop.statistics import Estimate
 from magtensor.loop.stretches import borne_out, louder
@@ -160,10 +160,11 @@ class State:
         adopted: the error models.
         theta: coefficients of each.
         fit: C and o.
-        residual: what is left, and its tangent space.
+        residual: what is left, and its tangent space, at `quick` many of the samples that the fit believes.
         excitation: at all samples of the record.
         terms: of all adopted models, at the residual's samples; None without any.
         estimate: of all coefficients together; None without any.
+        entire: the residual at all samples that the fit believes; None where `residual` is.
     """
 
     adopted: tuple[Adopted, ...]
@@ -174,11 +175,21 @@ class State:
     terms: Terms | None
     estimate: Estimate | None = None
     lines: tuple[float, ...] = field(default=())
+    entire: Residual | None = None
 
     @cached_property
     def colours(self) -> Colours:
         """Of the residual."""
         return colours_of(self.residual)
+
+    @property
+    def unabridged(self) -> State:
+        """The same at all samples that the fit believes."""
+        if self.entire is None:
+            return self
+        terms = None if self.terms is None else joined([a.terms(self.excitation) for a in self.adopted])
+        terms = None if terms is None else terms.at(self.entire.samples)
+        return replace(self, residual=self.entire, terms=terms, entire=None)
 
 
 @dataclass(frozen=True)
@@ -240,7 +251,7 @@ def joint_state(
                 fit = _fit(record, raw, reference, how, keep)
                 x = excitation_of(record, fit, lines)
                 each = [a.terms(x) for a in adopted]
-        residual = residual_of(fit, raw, reference, how.reference_noise)
+        residual = quick(residual_of(fit, raw, reference, how.reference_noise))
         terms = joined(each).at(residual.samples)
         colours = colours_of(residual)
         estimate = estimated(residual, terms, colours)
@@ -263,10 +274,12 @@ def joint_state(
             raw, reference = without(record, each, theta)
             fit = _fit(record, raw, reference, how, keep)
             x = excitation_of(record, fit, lines)
-    residual = residual_of(fit, raw, reference, how.reference_noise)
+    entire = residual_of(fit, raw, reference, how.reference_noise)
+    residual = quick(entire)
     if adopted:
         terms = joined([a.terms(x) for a in adopted]).at(residual.samples)
-    return State(tuple(adopted), tuple(theta), fit, residual, x, terms, estimate, tuple(lines))
+    left_out = None if residual is entire else entire
+    return State(tuple(adopted), tuple(theta), fit, residual, x, terms, estimate, tuple(lines), left_out)
 
 
 def without_noise(theta: Array, estimate: Estimate) -> Array:

@@ -1,0 +1,42 @@
+"""Surveys of a length that has a large prime factor: searched without their last samples, corrected at all."""
+
+from __future__ import annotations
+
+import numpy as np
+from loop_cases import linear_state, synthetic
+from scipy.fft import prev_fast_len
+
+from magtensor.loop.latent import sought, tried_source
+from magtensor.loop.model import Fitting
+from magtensor.registry import Registry
+
+PRIME = 5987  # samples
+
+
+def test_a_source_is_known_at_the_samples_that_the_search_leaves_out() -> None:
+    rng = np.random.default_rng(6)
+    waveform = np.convolve(rng.standard_normal(PRIME + 19), np.ones(20), mode="valid") / np.sqrt(20.0)
+    record = synthetic(5, samples=PRIME, added=waveform[:, None, None] * 3.0 * rng.standard_normal((4, 3)))
+    state = linear_state(record)
+    believed = np.flatnonzero(state.fit.keep)
+    length = prev_fast_len(len(believed))
+    assert 0 < len(believed) - length < 0.018 * PRIME
+    np.testing.assert_array_equal(state.residual.samples, believed[:length])
+    assert state.residual.across is not None and len(state.residual.across) == length
+    np.testing.assert_array_equal(state.unabridged.residual.samples, believed)
+    shared = sought(state, record)
+    assert shared is not None and len(shared.values) == len(believed)
+    hidden = Registry.load().find("error_model", "latent_source")
+    source = tried_source(hidden, record, state, shared, Fitting(), 0.005)[1]
+    assert source is not None and source.record.waveform is not None
+    found = source.record.waveform
+    last = slice(int(believed[length]), None)
+    assert abs(np.corrcoef(found[last], waveform[last])[0, 1]) > 0.9
+    entire = source.after.unabridged
+    assert entire.terms is not None and len(entire.terms.series) == source.after.fit.keep.sum()
+
+
+def test_short_ones_are_searched_whole() -> None:
+    state = linear_state(synthetic(7, samples=3001))
+    np.testing.assert_array_equal(state.residual.samples, np.flatnonzero(state.fit.keep))
+    assert state.unabridged is state
