@@ -47,14 +47,23 @@ def sampling_lag(
     source="Kotsiaros, Connerney and Martos 2020 (Juno); nine terms of Tolles and Lawson",
     typical="25 nT for a plate of time constant 1 ms at 0.5 rad/s",
 )
-def eddy_current(x: Excitation) -> Terms:
+def eddy_current(
+    x: Excitation,
+    *,
+    tau_s: Annotated[
+        float,
+        Range(0.0, 0.5, count=4, spacing="log"),
+        Field(ge=0, description="time constant of the conductor, s; 0 where the motion is too slow to show it"),
+    ] = 0.0,
+) -> Terms:
     """Conductors near a sensor shield the change of the field: minus dB/dt through a matrix of each sensor.
 
-    Nine coefficients a sensor: coupling times time constant. The part common to all sensors is a rotation of the
+    The currents decay with L/R, and follow the change through a first-order lag of that time constant. Nine
+    coefficients a sensor: coupling times time constant. The part common to all sensors is a rotation of the
     field and shows only against a reference. Rivals: `sampling_lag` and `bandwidth`, both contained in it;
     `viscous_magnetisation` with a short time constant.
     """
-    return x.matrices(-x.rate, "s")
+    return x.matrices(-x.relaxed(x.rate, tau_s), "s")
 
 
 @error_model(

@@ -1,11 +1,15 @@
 """Error models of the frame and of sensors that disturb each other."""
 
+from typing import Annotated
+
 import numpy as np
+from pydantic import Field
 
 from magtensor.attitude import into_platform
 from magtensor.calibration.types import Array
 from magtensor.components import error_model
 from magtensor.loop.excitation import AXES, Excitation
+from magtensor.loop.settings import Range
 from magtensor.loop.terms import Terms, joined
 from magtensor.units import GRAVITY
 from magtensor_effects.ageing import EventTime
@@ -20,13 +24,22 @@ UP = np.array([0.0, 0.0, 1.0])
     source="small rotation in proportion to the specific force",
     typical="1 arcmin is 14.5 nT, 29 nT/m on a baseline of 0.5 m",
 )
-def frame_flexure(x: Excitation) -> Terms:
+def frame_flexure(
+    x: Excitation,
+    *,
+    lag_s: Annotated[
+        float,
+        Range(0.0, 1.0, count=4, spacing="log"),
+        Field(ge=0, description="time constant of a frame that gives way late, s"),
+    ] = 0.0,
+) -> Terms:
     """The frame bends under gravity and acceleration and turns each sensor by a small angle.
 
     C (b x e g) with the specific force g in units of standard gravity and a matrix e of each sensor: nine
     coefficients, the turn about one axis for a force along another. The force is that of the logged acceleration, or
-    gravity alone from the attitude where none is logged. Rivals: `fixed_source` and `site_gradient`, for gravity and
-    a source are both fixed to the ground; the sag common to all sensors is not visible without a vector reference.
+    gravity alone from the attitude where none is logged; a damped frame follows it through a first-order lag. Rivals:
+    `fixed_source` and `site_gradient`, for gravity and a source are both fixed to the ground; the sag common to all
+    sensors is not visible without a vector reference.
     """
     if "acceleration" in x.logged:
         force = x.channel("acceleration") / GRAVITY
@@ -34,6 +47,7 @@ def frame_flexure(x: Excitation) -> Terms:
         force = into_platform(x.attitude, UP)
     else:
         raise KeyError("the survey has neither acceleration nor attitude")
+    force = x.relaxed(force, lag_s)
     bends = []
     for about in range(3):
         turned = x.sensed(np.cross(x.field, np.eye(3)[about] * ARCMIN))

@@ -171,6 +171,15 @@ def test_eddy_current_is_the_coupling_times_the_time_constant() -> None:
     np.testing.assert_allclose(per_matrix(fit, survey.sensors), expected, atol=1e-5)
 
 
+def test_eddy_currents_of_a_thick_plate() -> None:
+    # 0.1 s at rates of 0.44 rad/s: without the lag a twentieth is left
+    effect = {"coupling": np.random.default_rng(3).standard_normal((4, 3, 3)).tolist(), "tau_s": 0.1}
+    with_lag, survey, _ = fitted("eddy_current", {"tau_s": 0.1}, effect, after_s=START_S)
+    assert with_lag.left < 0.005 < 0.03 < fitted("eddy_current", {}, effect, after_s=START_S)[0].left
+    expected = 0.1 * survey.truth.matrix @ np.array(effect["coupling"])
+    np.testing.assert_allclose(per_matrix(with_lag, survey.sensors), expected, atol=1e-3)
+
+
 def test_eddy_currents_contain_delays_and_filters() -> None:
     assert fitted("eddy_current", {}, {"rms_nT": 3.0}, simulated_as="sampling_lag", after_s=START_S)[0].left < 0.005
     assert fitted("eddy_current", {}, {"rms_nT": 3.0}, simulated_as="bandwidth", after_s=START_S)[0].left < 0.005
@@ -224,6 +233,15 @@ def test_frame_flexure_in_arcmin_per_g(known_by: str) -> None:
     fit, survey, _ = fitted("frame_flexure", {}, {"arcmin_per_g": bends.tolist()}, base)
     assert fit.left < 0.005
     # the simulator's g is 9.81; second order is one arcmin, 3e-4
+    np.testing.assert_allclose(per_matrix(fit, survey.sensors), bends, atol=0.01)
+
+
+def test_a_damped_frame_gives_way_late() -> None:
+    bends = np.random.default_rng(4).standard_normal((4, 3, 3))
+    effect = {"arcmin_per_g": bends.tolist(), "lag_s": 0.3}
+    base = TUMBLING | {"logging": {"acceleration": True}}
+    fit, survey, _ = fitted("frame_flexure", {"lag_s": 0.3}, effect, base, after_s=START_S)
+    assert fit.left < 0.005 < 0.05 < fitted("frame_flexure", {}, effect, base, after_s=START_S)[0].left
     np.testing.assert_allclose(per_matrix(fit, survey.sensors), bends, atol=0.01)
 
 

@@ -11,6 +11,7 @@ from magtensor.errors import UsageError
 from magtensor.simulate.channels import ChannelSpec, one_channel
 from magtensor.simulate.effects.base import Bench, SensorEffectSpec
 from magtensor.simulate.motion import specific_force
+from magtensor.simulate.processes import low_pass
 from magtensor.simulate.rotations import exponential, matrices, transform, transform_back
 from magtensor.simulate.sources import MU0_OVER_4PI, dipole_field
 from magtensor.simulate.spec import Array, Matrix3, PerSensor, Spec, Vector3, stream
@@ -234,6 +235,7 @@ class FrameFlexure(SensorEffectSpec):
     arcmin_per_g: list[Matrix3] | None = Field(
         None, description="rotation vector of each sensor per specific force in the platform frame"
     )
+    lag_s: float = Field(0.0, ge=0, description="time constant of the frame behind the force, s")
 
     def drawn(self, bench: Bench, rng: np.random.Generator) -> Array:
         return rng.standard_normal((bench.sensors, 3, 3))
@@ -243,9 +245,10 @@ class FrameFlexure(SensorEffectSpec):
 
     def waveform(self, bench: Bench, coefficients: Array) -> Array:
         turned = np.empty(bench.b.shape)
+        motion = bench.field.motion
+        forces = low_pass(lambda t: specific_force(motion, t), bench.time, self.lag_s, chunk=bench.chunk) / G_M_S2
         for piece in bench.pieces():
-            force = specific_force(bench.field.motion, bench.time[piece])[:, None] / G_M_S2
-            bend = matrices(exponential(ARCMIN * transform(coefficients, force)))
+            bend = matrices(exponential(ARCMIN * transform(coefficients, forces[piece, None])))
             turned[piece] = transform_back(bend, bench.b[piece]) - bench.b[piece]
         return bench.sensed(turned)
 
