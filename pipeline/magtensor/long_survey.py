@@ -252,7 +252,7 @@ def _prepared(
                 where=f"{found.attributes.get('source', '')}: time",
             )
         raw, total_field = found.values("b_raw"), found.values("total_field")
-        usable.append(found.good & np.isfinite(total_field) & np.isfinite(raw).all(axis=(1, 2)))
+        usable.append(found.readings & np.isfinite(total_field) & np.isfinite(raw).all(axis=(1, 2)))
         np.column_stack([raw.reshape(len(raw), -1), total_field]).astype(np.float64).tofile(file)
         pick = even_blocks(len(raw), SELECTED // len(where))
         nodes = {name: node.to_dataset() for name, node in found.tree.children.items()}

@@ -17,7 +17,7 @@ from magtensor.survey.model import Survey, Variable
 if TYPE_CHECKING:
     import xarray as xr
 
-ALWAYS_READABLE = ("time", "sensor", "axis", "good")
+ALWAYS_READABLE = ("time", "sensor", "axis", "good", "reading")
 
 
 @dataclass(frozen=True)

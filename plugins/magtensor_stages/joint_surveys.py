@@ -60,7 +60,7 @@ def usable_samples(survey: Survey, field: Field, name: str) -> np.ndarray:
     for path in needed:
         if path not in survey:
             raise DataError(f"calibrate_joint needs {path}, which this survey does not have", where=name)
-    use = survey.good & np.isfinite(survey.values("b_raw")).all(axis=(1, 2))
+    use = survey.readings & np.isfinite(survey.values("b_raw")).all(axis=(1, 2))
     if field.measured and "total_field" in survey:
         use &= np.isfinite(survey.values("total_field"))
     if field.vector:

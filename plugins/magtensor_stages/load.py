@@ -18,11 +18,14 @@ from magtensor.survey.model import AXES, Survey
 BY = "load"
 
 
+_READ_TOGETHER = 0.5  # of the readings of the sensor that has the fewest
+
+
 @stage(
     gives=("time", "sensor", "axis", "b_raw", "good"),
     may_give=(
         "position", "reference/time", "reference/total_field", "reference/world_field", "temperature", "current_*",
-        "acceleration", "angular_rate", "attitude", "segment",
+        "acceleration", "angular_rate", "attitude", "segment", "reading",
     ),
 )  # fmt: skip
 def load(
@@ -56,7 +59,9 @@ def load(
 
     Refused: times that do not increase, an axis without signal, a sensor that is stuck, two axes with the same
     numbers, magnitudes that betray wrong units, more flagged samples than allowed. Flagged: missing and infinite
-    values, saturation, runs in which a sensor repeats itself. Reported with the variables: sampling, quantisation.
+    values, saturation, runs in which a sensor repeats itself. No calibration is fitted to rows that repeat a reading or
+    lie on the line between two, in a recording faster than its sensors. Reported with the variables: sampling,
+    quantisation.
     """
     if survey.source is None:
         raise UsageError("load: the recipe has no `survey` section, and no survey was named on the command line")
@@ -84,11 +89,11 @@ def load(
                 where=f"{where}: sensor {name}",
                 hint=f"load allows max_flagged_share {max_flagged_share:g}; `sensors` can leave the sensor out",
             )
+    given = _readings(found, notes)
     attributes = {**found.attributes, **({"notes": notes} if notes else {})}
     loaded = replace(found, attributes=attributes, source=survey.source)
-    return loaded.merged(
-        {**_described(loaded), "good": (("time", "sensor"), good, {"long_name": "may be used"})}, flags
-    )
+    given["good"] = (("time", "sensor"), good, {"long_name": "may be used"})
+    return loaded.merged({**_described(loaded), **given}, flags)
 
 
 def _clock(seconds: float) -> str:
@@ -315,6 +320,22 @@ def _flagged(
             flags += flag_ranges(time, bad, by=BY, reason=reason, sensor=name)
             good[:, s] &= ~bad
     return good, flags
+
+
+def _readings(survey: Survey, notes: list[str]) -> dict[str, Any]:
+    """Which rows hold readings, where some are filled in; nothing where the sensors are read in different rows."""
+    field = survey.values("b_raw")
+    reading = ~np.column_stack([checks.filled_in(field[:, s]) for s in range(field.shape[1])])
+    if reading.all():
+        return {}
+    own = reading.mean(axis=0)
+    words = ", ".join(f"{name} {1 - share:.0%}" for name, share in zip(survey.sensors, own, strict=True) if share < 1)
+    words = f"rows that repeat a reading or lie on the line between two: {words}"
+    if reading.all(axis=1).mean() < _READ_TOGETHER * own.min():
+        notes.append(f"{words}; the sensors are read in different rows, and all are used")
+        return {}
+    notes.append(f"{words}; no calibration is fitted to them")
+    return {"reading": (("time", "sensor"), reading, {"long_name": "a reading, neither repeated nor interpolated"})}
 
 
 def _described(survey: Survey) -> dict[str, Any]:

@@ -21,7 +21,7 @@ FITTED = ("calibration/*", "calibrated/b", "residual/total_field", "residual/tot
 
 def usable(survey: Survey, sensor: int) -> np.ndarray:
     """(N,) samples of one sensor that may enter a fit: not flagged, finite, with a total field where one is used."""
-    good = survey.good_by_sensor[:, sensor] & np.isfinite(survey.values("b_raw")[:, sensor]).all(axis=1)
+    good = survey.readings_by_sensor[:, sensor] & np.isfinite(survey.values("b_raw")[:, sensor]).all(axis=1)
     if "total_field" in survey:
         good = good & np.isfinite(survey.values("total_field"))
     return good
@@ -118,7 +118,7 @@ def calibrate_array(survey: Survey, *, method: MethodChoice) -> dict[str, Any]:
     A method is ``f(raw (N, S, 3) nT, total_field (N,) nT, *, options) -> ArrayCalibration``.
     """
     raw, total_field = survey.values("b_raw"), survey.values("total_field")
-    good = survey.good & np.isfinite(total_field) & np.isfinite(raw).all(axis=(1, 2))
+    good = survey.readings & np.isfinite(total_field) & np.isfinite(raw).all(axis=(1, 2))
     if not good.any():
         raise NotEnoughData(
             "no sample has all sensors in use and a total field", where=str(survey.attributes.get("source", ""))
@@ -176,7 +176,7 @@ def estimated_field(survey: Survey) -> tuple[np.ndarray, dict[str, Any]]:
     attitude, total_field = survey.values("attitude"), np.asarray(survey.values("total_field"), dtype=float)
     raw = np.asarray(survey.values("b_raw"), dtype=float)
     turn = np.stack([into_platform(attitude, axis) for axis in np.eye(3)], axis=2)
-    use = survey.good & np.isfinite(total_field)
+    use = survey.readings & np.isfinite(total_field)
     use &= np.isfinite(turn).all(axis=(1, 2)) & np.isfinite(raw).all(axis=(1, 2))
     if not use.any():
         raise NotEnoughData("no sample has all sensors in use, an attitude and a total field")

@@ -6,8 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from loop_cases import linear_state, scenario, synthetic, verdict_of
+import xarray as xr
+from loop_cases import linear_state, scenario, survey_file, synthetic, verdict_of
 
+import magtensor
 from magtensor.loop.contribution import eliminate, removal
 from magtensor.loop.model import Adopted, Fitting, joint_state
 from magtensor.loop.statistics import symmetric_eigen
@@ -62,3 +64,20 @@ def test_a_matrix_that_lapack_gives_up_on(monkeypatch: pytest.MonkeyPatch) -> No
     expected = real(matrices)[0]
     monkeypatch.setattr(np.linalg, "eigh", eigh)
     np.testing.assert_allclose(symmetric_eigen(matrices)[0], expected)
+
+
+def test_a_recording_faster_than_its_sensor(tmp_path: Path) -> None:
+    """Readings at 20 Hz, filled in to 60 Hz by straight lines: the noise has a colour, and every regressor holds it."""
+    survey = scenario(23, rate_Hz=20.0)
+    noise = {"white_sd_nT": 700.0, "flicker_nT_per_rtHz": 0.0}
+    survey["instrument"] = survey["instrument"] | {"array": {"positions_m": [[0.0, 0.0, 0.0]]}, "noise": noise}
+    survey["motion"] = survey["motion"] | {"duration_s": 120.0, "rate_rms_deg_s": 30.0}
+    groups = dict(xr.open_groups(survey_file(tmp_path, survey), decode_times=False))
+    time = groups["/"]["time"]
+    rows = np.linspace(0, len(time) - 1, 3 * (len(time) - 1) + 1)
+    between = xr.DataArray(np.interp(rows, np.arange(len(time)), time.values), dims="time", attrs=time.attrs)
+    groups["/"] = groups["/"][["b_raw"]].interp(time=between)
+    groups["/"]["b_raw"].attrs["units"] = "nT"
+    done = magtensor.close_loop({name: groups[name] for name in ("/", "/reference")}, search=OF_THE_FIELD)
+    assert done.verdict["adopted"] == []
+    assert done.verdict["noise_floor_nT"] == pytest.approx(700.0, rel=0.1)

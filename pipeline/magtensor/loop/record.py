@@ -45,7 +45,7 @@ def record_of(
     if use is None and every:
         use = np.ones(len(time), dtype=bool)
     elif use is None:
-        use = survey.good & np.isfinite(raw).all(axis=(1, 2))
+        use = survey.readings & np.isfinite(raw).all(axis=(1, 2))
         if total_field is not None:
             use &= np.isfinite(total_field)
     logged, units = channels_of(survey)

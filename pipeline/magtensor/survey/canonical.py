@@ -32,7 +32,8 @@ LAYOUT: dict[str, tuple[tuple[tuple[str, ...], ...], str | None]] = {
     "segment": ((("time",),), None),
 }
 _CURRENT = ((("time",),), "A")
-RESULTS = ("good", "total_field", "total_field_std", "diurnal")  # what stages give; no channel may have these names
+# what stages give; no channel may have these names
+RESULTS = ("good", "reading", "total_field", "total_field_std", "diurnal")
 LENGTHS = {"axis": 3, "quaternion": 4}
 
 

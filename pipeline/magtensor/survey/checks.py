@@ -19,6 +19,10 @@ EARTH_FIELD_NT = (22_000.0, 67_000.0)
 MARGIN = 2.0
 LARGEST_ARRAY_M = 100.0
 IMPOSSIBLE = 1e3  # times a sensor's median magnitude: no range reaches so far beyond what it measures
+SINGLE_PRECISION = (
+    2e-7  # of the largest number: what interpolated values are off by where they are stored in four bytes
+)
+LEAST_FILLED_IN = 0.05  # of the rows
 LOOKED_AT = 200_000  # samples; a step shows in these as in ten million
 # What a number that was labelled nT may have been, with the factor that makes nT of it.
 RIVALS = (
@@ -359,6 +363,33 @@ def copies(field: Floats) -> list[tuple[int, int, int, int]]:
             if np.array_equal(flat[:, i], flat[:, j], equal_nan=True) and whole.any() and np.ptp(flat[whole, i]) > 0:
                 found.append((i // 3, i % 3, j // 3, j % 3))
     return found
+
+
+def filled_in(field: Floats) -> Bools:
+    """(N,) True where a row holds no reading of its own: a recording faster than its sensor repeats a reading, or holds
+    values on the straight line between two.
+
+    All axes do so at once; coarse steps and slow turns make each axis repeat by itself. Only rows where the field moves
+    by three steps of the sensor tell the two apart.
+
+    Args:
+        field: (N, 3) nT.
+    """
+    none = np.zeros(len(field), dtype=bool)
+    if len(field) < 20:
+        return none
+    before, now, after = field[:-2], field[1:-1], field[2:]
+    rounding = SINGLE_PRECISION * np.nanmax(np.abs(field))
+    alike = (now == before) | (np.abs(after - 2.0 * now + before) <= rounding)
+    step = max(resolution(column) for column in field.T)
+    moving = np.linalg.norm(after - before, axis=1) > 3.0 * step
+    if moving.sum() < 20:
+        return none
+    each, together = alike[moving].mean(axis=0), alike[moving].all(axis=1).mean()
+    if together < LEAST_FILLED_IN or together < 0.7 * each.max() or np.prod(each) > 0.5 * together:
+        return none
+    none[1:-1] = alike.all(axis=1)
+    return none
 
 
 def new_share(field: Floats) -> float:

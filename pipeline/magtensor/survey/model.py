@@ -149,6 +149,19 @@ class Survey:
             return np.asarray(self.values("good"), dtype=bool)
         return np.ones((len(self.time), len(self.sensors)), dtype=bool)
 
+    @property
+    def readings_by_sensor(self) -> NDArray[np.bool_]:
+        """(N, S) True where the sensor's sample may be used and is a reading, none that was repeated or interpolated to
+        fill a row: what a calibration is fitted to."""
+        if "reading" in self:
+            return np.asarray(self.good_by_sensor & self.values("reading"))
+        return self.good_by_sensor
+
+    @property
+    def readings(self) -> NDArray[np.bool_]:
+        """(N,) the same of all sensors at once."""
+        return np.asarray(self.readings_by_sensor.all(axis=1))
+
 
 def without_variables(survey: Survey, *paths: str) -> Survey:
     """The survey without some of its variables."""

@@ -1,0 +1,89 @@
+"""Recordings faster than their sensors: rows that repeat a reading or lie between two are found, nothing else is."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from test_load import Load, Variables, changed
+
+from magtensor.survey.checks import filled_in
+
+
+def turning(samples: int, noise_nT: float, seed: int = 3, step_s: float = 0.01) -> np.ndarray:
+    """(N, 3) nT of a sensor that turns, with noise."""
+    rng = np.random.default_rng(seed)
+    t = step_s * np.arange(samples)
+    angle = 0.8 * np.sin(0.7 * t) + 1.1 * t
+    field = 48e3 * np.column_stack([np.cos(angle), np.sin(angle) * np.cos(0.5 * t), np.sin(angle) * np.sin(0.5 * t)])
+    return np.asarray(field + noise_nT * rng.standard_normal(field.shape))
+
+
+def interpolated(values: np.ndarray, times: int) -> np.ndarray:
+    at = np.arange((len(values) - 1) * times + 1) / times
+    return np.column_stack([np.interp(at, np.arange(len(values)), column) for column in values.T])
+
+
+@pytest.mark.parametrize("kind", ["float64", "float32", "tenths"])
+def test_interpolated_rows_are_found(kind: str) -> None:
+    values = turning(800, 100.0)
+    if kind == "tenths":
+        values = np.round(values, 1)
+    field = interpolated(values, 3)
+    if kind == "float32":
+        field = field.astype(np.float32).astype(float)
+    expected = np.arange(len(field)) % 3 != 0
+    assert (filled_in(field) == expected).mean() > 0.995
+
+
+@pytest.mark.parametrize("times", [2, 3, 10])
+def test_repeated_rows_are_found(times: int) -> None:
+    values = np.round(turning(800, 100.0) / 150.0) * 150.0
+    found = filled_in(np.repeat(values, times, axis=0))
+    assert (found == (np.arange(len(found)) % times != 0)).mean() > 0.98
+
+
+@pytest.mark.parametrize(
+    ("noise_nT", "step_nT", "step_s"),
+    [
+        (0.15, 0.0, 0.1),  # a good fluxgate
+        (0.15, 0.0, 1e-4),  # at rest, for 200 ms
+        (50.0, 150.0, 0.01),  # steps of a telephone's sensor
+        (5.0, 150.0, 0.01),
+        (0.5, 150.0, 1e-3),  # steps far above the noise, in a slow turn
+        (0.01, 1.0, 0.002),
+    ],
+)
+def test_readings_are_not(noise_nT: float, step_nT: float, step_s: float) -> None:
+    field = turning(2000, noise_nT, step_s=step_s)
+    if step_nT:
+        field = np.round(field / step_nT) * step_nT
+    assert not filled_in(field).any()
+
+
+def test_rest_between_turns_in_coarse_steps_is_not() -> None:
+    turns = [np.repeat(turning(8, 0.0, seed, 1.0)[-1:], 60, axis=0) for seed in range(12)]
+    field = np.concatenate([np.concatenate([rest, turning(20, 1.0, 9, 0.03)]) for rest in turns])
+    field = 100.0 * np.round((field + np.random.default_rng(4).standard_normal(field.shape)) / 100.0)
+    assert not filled_in(field).any()
+
+
+def test_no_calibration_is_fitted_to_them(load_variables: Load, variables: Variables) -> None:
+    own: Any = variables["b_raw"][1]
+    rng = np.random.default_rng(8)
+    field = np.repeat(own[::2] + 10.0 * rng.standard_normal(own[::2].shape), 2, axis=0)
+    survey = load_variables(changed(variables, "b_raw", lambda _: field))
+    assert survey.good.all()
+    np.testing.assert_array_equal(survey.readings[2:-1], (np.arange(len(field)) % 2 == 0)[2:-1])
+    assert "no calibration is fitted to them" in survey.attributes["notes"][0]
+
+
+def test_sensors_that_are_read_in_turn_are_all_used(load_variables: Load, variables: Variables) -> None:
+    own: Any = variables["b_raw"][1]
+    field = np.array(own, copy=True)
+    for s in range(4):
+        field[:, s] = own[np.maximum((np.arange(len(own)) - s) // 4 * 4 + s, 0), s]
+    survey = load_variables(changed(variables, "b_raw", lambda _: field))
+    assert survey.readings.all()
+    assert "the sensors are read in different rows" in survey.attributes["notes"][0]
