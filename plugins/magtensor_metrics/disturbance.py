@@ -73,5 +73,5 @@ def outliers(
 def _residual(survey: Survey, sensor: int) -> tuple[np.ndarray, np.ndarray]:
     """(N,) samples in use, and |b| - F of those."""
     b, reference = survey.values("calibrated/b")[:, sensor], survey.values("total_field")
-    good = survey.good_by_sensor[:, sensor] & np.isfinite(reference) & np.isfinite(b).all(axis=1)
+    good = survey.readings_by_sensor[:, sensor] & np.isfinite(reference) & np.isfinite(b).all(axis=1)
     return good, np.linalg.norm(b[good], axis=1) - reference[good]

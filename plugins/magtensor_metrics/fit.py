@@ -31,7 +31,7 @@ def total_field(survey: Survey, *, warn_ratio: Ratio = 1.5, fail_ratio: Ratio = 
     the calibration says that its scale was not measured, |b| is compared after the one scale that fits F best.
     """
     b, reference = survey.values("calibrated/b"), survey.values("total_field")
-    known = survey.good_by_sensor & np.isfinite(reference)[:, None]
+    known = survey.readings_by_sensor & np.isfinite(reference)[:, None]
     free = any(words.startswith(COMMON_SCALE) for words in left_open(survey))
     if free and known.any():
         size, field = np.linalg.norm(b, axis=2)[known], np.broadcast_to(reference[:, None], known.shape)[known]
@@ -50,7 +50,7 @@ def total_field(survey: Survey, *, warn_ratio: Ratio = 1.5, fail_ratio: Ratio = 
 @metric(needs=("residual/contrast",), uses=("total_field",))
 def contrast(survey: Survey, *, warn_ratio: Ratio = 1.5, fail_ratio: Ratio = 30.0) -> list[Verdict]:
     """RMS of each sensor's field less the mean of all, against the noise; both are zero-mean in a uniform field."""
-    values = survey.values("residual/contrast")[survey.good]
+    values = survey.values("residual/contrast")[survey.readings]
     n = len(survey.sensors)
     if n < 2:
         return []
@@ -79,7 +79,7 @@ def closure(survey: Survey, *, warn_ratio: Ratio = 1.5, fail_ratio: Ratio = 30.0
         return []
     expected = np.sqrt(np.einsum("rcsa,sa->rc", gain**2, noise**2))
     block = error_block(
-        survey.values("calibrated/b"), None, survey.values("calibrated/tensor"), survey.good_by_sensor, survey.sensors
+        survey.values("calibrated/b"), None, survey.values("calibrated/tensor"), survey.readings_by_sensor, survey.sensors
     )["tensor_rms_nT_per_m"]
     index = {"x": 0, "y": 1, "z": 2}
     return [
