@@ -141,7 +141,7 @@ def run_long(
                 say(f"writing window {k} of {len(where)}")
                 found = apply_to(survey, survey_file, planned, rows=rows, judge=False)  # the fit has judged them
                 found = found.merged(contrasts(found.values("calibrated/b")) if len(found.sensors) > 1 else {})
-                bad = doubted[done : done + len(found.time)]
+                bad = found.made_from(doubted[done : done + len(found.time)])
                 done += len(found.time)
                 good = found.good_by_sensor & ~bad[:, None]
                 found = found.merged({"good": (("time", "sensor"), good, {"long_name": "may be used"})})

@@ -78,9 +78,8 @@ def closure(survey: Survey, *, warn_ratio: Ratio = 1.5, fail_ratio: Ratio = 30.0
     if not np.isfinite(noise).all():
         return []
     expected = np.sqrt(np.einsum("rcsa,sa->rc", gain**2, noise**2))
-    block = error_block(
-        survey.values("calibrated/b"), None, survey.values("calibrated/tensor"), survey.readings_by_sensor, survey.sensors
-    )["tensor_rms_nT_per_m"]
+    b, tensor = survey.values("calibrated/b"), survey.values("calibrated/tensor")
+    block = error_block(b, None, tensor, survey.readings_by_sensor, survey.sensors)["tensor_rms_nT_per_m"]
     index = {"x": 0, "y": 1, "z": 2}
     return [
         _against_noise(

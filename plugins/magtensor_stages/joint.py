@@ -277,6 +277,7 @@ def _flagged(survey: Survey, doubted: np.ndarray) -> dict[str, Any]:
     """The samples (N,) that no noise explains."""
     if not doubted.any():
         return {}
+    doubted = survey.made_from(doubted)
     good = survey.good_by_sensor & ~doubted[:, None]
     return {
         "good": (("time", "sensor"), good, {"long_name": "may be used"}),

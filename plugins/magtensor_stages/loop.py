@@ -132,6 +132,7 @@ def close_loop(
     if not last.fit.keep.all():
         doubted = np.zeros(len(survey.time), dtype=bool)
         doubted[record.samples[~last.fit.keep]] = True
+        doubted = survey.made_from(doubted)
         given["good"] = (("time", "sensor"), survey.good_by_sensor & ~doubted[:, None], {"long_name": "may be used"})
         given["flags"] = flag_ranges(
             survey.time, doubted, by="close_loop", reason="no calibration and no noise explain it"

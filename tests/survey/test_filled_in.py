@@ -25,15 +25,16 @@ def interpolated(values: np.ndarray, times: int) -> np.ndarray:
     return np.column_stack([np.interp(at, np.arange(len(values)), column) for column in values.T])
 
 
+@pytest.mark.parametrize("times", [2, 3, 10])
 @pytest.mark.parametrize("kind", ["float64", "float32", "tenths"])
-def test_interpolated_rows_are_found(kind: str) -> None:
+def test_interpolated_rows_are_found(kind: str, times: int) -> None:
     values = turning(800, 100.0)
     if kind == "tenths":
         values = np.round(values, 1)
-    field = interpolated(values, 3)
+    field = interpolated(values, times)
     if kind == "float32":
         field = field.astype(np.float32).astype(float)
-    expected = np.arange(len(field)) % 3 != 0
+    expected = np.arange(len(field)) % times != 0
     assert (filled_in(field) == expected).mean() > 0.995
 
 
@@ -53,6 +54,9 @@ def test_repeated_rows_are_found(times: int) -> None:
         (5.0, 150.0, 0.01),
         (0.5, 150.0, 1e-3),  # steps far above the noise, in a slow turn
         (0.01, 1.0, 0.002),
+        (0.0, 0.0, 1e-3),  # without noise
+        (0.0, 0.0, 0.1),
+        (0.0, 10.0, 0.01),
     ],
 )
 def test_readings_are_not(noise_nT: float, step_nT: float, step_s: float) -> None:
@@ -60,6 +64,7 @@ def test_readings_are_not(noise_nT: float, step_nT: float, step_s: float) -> Non
     if step_nT:
         field = np.round(field / step_nT) * step_nT
     assert not filled_in(field).any()
+    assert not filled_in(field.astype(np.float32).astype(float)).any()
 
 
 def test_rest_between_turns_in_coarse_steps_is_not() -> None:
@@ -77,6 +82,18 @@ def test_no_calibration_is_fitted_to_them(load_variables: Load, variables: Varia
     assert survey.good.all()
     np.testing.assert_array_equal(survey.readings[2:-1], (np.arange(len(field)) % 2 == 0)[2:-1])
     assert "no calibration is fitted to them" in survey.attributes["notes"][0]
+
+
+def test_a_spike_is_flagged_with_what_was_made_from_it(load_variables: Load, variables: Variables) -> None:
+    own: Any = variables["b_raw"][1]
+    readings = own[::4] + 10.0 * np.random.default_rng(8).standard_normal(own[::4].shape)
+    flat = interpolated(readings.reshape(len(readings), -1), 4)[: len(own)]
+    field = np.concatenate([flat, np.repeat(flat[-1:], len(own) - len(flat), axis=0)]).reshape(own.shape)
+    survey = load_variables(changed(variables, "b_raw", lambda _: field))
+    spike = np.zeros(len(field), dtype=bool)
+    spike[200] = True
+    assert survey.readings[200]
+    np.testing.assert_array_equal(np.flatnonzero(survey.made_from(spike)), np.arange(197, 204))
 
 
 def test_sensors_that_are_read_in_turn_are_all_used(load_variables: Load, variables: Variables) -> None:

@@ -19,10 +19,10 @@ EARTH_FIELD_NT = (22_000.0, 67_000.0)
 MARGIN = 2.0
 LARGEST_ARRAY_M = 100.0
 IMPOSSIBLE = 1e3  # times a sensor's median magnitude: no range reaches so far beyond what it measures
-SINGLE_PRECISION = (
-    2e-7  # of the largest number: what interpolated values are off by where they are stored in four bytes
-)
-LEAST_FILLED_IN = 0.05  # of the rows
+# of the largest number: rounding of interpolated values that are stored in four bytes or in eight
+SINGLE_PRECISION, DOUBLE_PRECISION = 2e-7, 1e-12
+LEAST_FILLED_IN, MOST_FILLED_IN = 0.05, 0.96  # of the rows
+NEARLY_ALL = 0.8  # of the rows that are alike on all axes
 LOOKED_AT = 200_000  # samples; a step shows in these as in ten million
 # What a number that was labelled nT may have been, with the factor that makes nT of it.
 RIVALS = (
@@ -379,17 +379,36 @@ def filled_in(field: Floats) -> Bools:
     if len(field) < 20:
         return none
     before, now, after = field[:-2], field[1:-1], field[2:]
-    rounding = SINGLE_PRECISION * np.nanmax(np.abs(field))
-    alike = (now == before) | (np.abs(after - 2.0 * now + before) <= rounding)
+    single = (field == field.astype(np.float32)).all()
+    rounding = (SINGLE_PRECISION if single else DOUBLE_PRECISION) * np.nanmax(np.abs(field))
+    bend = np.abs(after - 2.0 * now + before)
+    alike = (now == before) | (bend <= rounding)
     step = max(resolution(column) for column in field.T)
     moving = np.linalg.norm(after - before, axis=1) > 3.0 * step
     if moving.sum() < 20:
         return none
-    each, together = alike[moving].mean(axis=0), alike[moving].all(axis=1).mean()
-    if together < LEAST_FILLED_IN or together < 0.7 * each.max() or np.prod(each) > 0.5 * together:
+    together = float(alike[moving].all(axis=1).mean())
+    shared = _at_once(together, alike[moving].mean(axis=0))
+    if not LEAST_FILLED_IN < together < MOST_FILLED_IN or shared < NEARLY_ALL * together:
+        return none
+    bent = bend[moving & ~alike.all(axis=1)].max(axis=1)
+    if np.median(bent) < 5.0 * rounding:  # so smooth that three rows are nearly straight
         return none
     none[1:-1] = alike.all(axis=1)
     return none
+
+
+def _at_once(together: float, each: Floats) -> float:
+    """The share h of rows that are alike on all axes at once, where in the others each axis is alike by itself.
+
+    Of all axes h + (1 - h) p1 p2 p3 are alike, of one h + (1 - h) p; given are those shares.
+    """
+    low, high = 0.0, together
+    for _ in range(40):
+        h = 0.5 * (low + high)
+        beyond = (together - h) * (1.0 - h) ** (len(each) - 1) > np.prod(each - h)
+        low, high = (h, high) if beyond else (low, h)
+    return low
 
 
 def new_share(field: Floats) -> float:

@@ -162,6 +162,16 @@ class Survey:
         """(N,) the same of all sensors at once."""
         return np.asarray(self.readings_by_sensor.all(axis=1))
 
+    def made_from(self, bad: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """(N,) bad readings, and the rows that were filled in from one of them."""
+        at = np.flatnonzero(self.readings)
+        if "reading" not in self or not bad.any() or not len(at):
+            return bad
+        row = np.arange(len(bad))
+        before = at[np.maximum(np.searchsorted(at, row, side="right") - 1, 0)]
+        after = at[np.minimum(np.searchsorted(at, row), len(at) - 1)]
+        return np.asarray(bad | (~self.readings & (bad[before] | bad[after])))
+
 
 def without_variables(survey: Survey, *paths: str) -> Survey:
     """The survey without some of its variables."""
