@@ -379,7 +379,7 @@ def filled_in(field: Floats) -> Bools:
     if len(field) < 20:
         return none
     before, now, after = field[:-2], field[1:-1], field[2:]
-    single = (field == field.astype(np.float32)).all()
+    single = np.array_equal(field, field.astype(np.float32), equal_nan=True)
     rounding = (SINGLE_PRECISION if single else DOUBLE_PRECISION) * np.nanmax(np.abs(field))
     bend = np.abs(after - 2.0 * now + before)
     alike = (now == before) | (bend <= rounding)
