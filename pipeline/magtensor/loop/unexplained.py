@@ -58,7 +58,8 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
             + (f": {MODEL}, which cannot be tested without {lacks}, would look like this" if lacks else "")
         )
     if words:
-        words.insert(0, f"{excess:.3g} nT rms above the white noise, mostly on {_sensors(state)}")
+        size = f"{excess:.3g} nT rms above the white noise" if excess else "in sum no more than the white noise"
+        words.insert(0, f"{size}, mostly on {_sensors(state)}")
     if flagged.any():
         words.append(flagged_words(flagged, state, record))
     present = bool(words)
