@@ -38,6 +38,12 @@ def test_interpolated_rows_are_found(kind: str, times: int) -> None:
     assert (filled_in(field) == expected).mean() > 0.995
 
 
+@pytest.mark.parametrize("noise_nT", [2.0, 100.0])
+def test_lines_that_were_printed_with_decimals(noise_nT: float) -> None:
+    field = np.round(interpolated(turning(800, noise_nT), 4), 2)
+    assert (filled_in(field) == (np.arange(len(field)) % 4 != 0)).mean() > 0.97
+
+
 @pytest.mark.parametrize("times", [2, 3, 10])
 def test_repeated_rows_are_found(times: int) -> None:
     values = np.round(turning(800, 100.0) / 150.0) * 150.0
@@ -57,6 +63,8 @@ def test_repeated_rows_are_found(times: int) -> None:
         (0.0, 0.0, 1e-3),  # without noise
         (0.0, 0.0, 0.1),
         (0.0, 10.0, 0.01),
+        (2.0, 0.01, 0.01),  # printed with decimals
+        (0.02, 0.01, 1e-3),
     ],
 )
 def test_readings_are_not(noise_nT: float, step_nT: float, step_s: float) -> None:

@@ -55,6 +55,33 @@ def predictable_in_the_total_field(state: State) -> float:
     return _predictable(state, joined(each))
 
 
+def shortened_words(state: State) -> list[str]:
+    """What of |b| - F follows the square of the rate at which the field turns in the sensors' frame, as it does where
+    an output is the mean over some time.
+
+    The mean of a vector that turns is shorter: over T by |db/dt|^2 T^2 / (24 F) (Taylor). Rows interpolated between
+    two readings, and the filters of a recorder, do the same.
+    """
+    x, residual = state.excitation, state.residual
+    rate = x.rate if x.rate.ndim == 2 else x.rate.mean(axis=1)
+    series = np.sum(rate**2, axis=1) / np.linalg.norm(x.field[:, 0], axis=1)
+    if residual.along is None or series.std() <= 1e-6 * np.abs(x.field).max():
+        return []
+    part = _predictable(state, x.on_reference(series, "s2", "rate"))
+    if part == 0.0:
+        return []
+    seen = series[residual.samples] - series[residual.samples].mean()
+    slope = float(seen @ (residual.along / -residual.reference_gain) / (seen @ seen))
+    if slope >= 0:
+        return []
+    amount = -slope * float(seen.std())
+    return [
+        f"{amount:.3g} nT rms of |b| - F, in all sensors alike, follows the square of the rate at which the field "
+        f"turns, as if every row were the mean over {np.sqrt(-24.0 * slope):.2g} s: rows that are averaged, "
+        "interpolated or low-passed shorten the field"
+    ]
+
+
 def _predictable(state: State, terms: Terms) -> float:
     """The part of the whitened residual, rms over all its values, that terms at all samples predict on blocks that they
     were not fitted to; 0 if none."""

@@ -114,8 +114,10 @@ def search(
         gone = (*([instead] if instead else []), *(() if NAME in dropped else dropped))
         steps[-1] = replace(steps[-1], adopted=source.evidence, dropped=gone)
         standing = trial(record, state, how)
-    found = Search(first, _settled(record, state, how), tuple(steps), not_tested, failed, record, shared)
-    found = replace(found, shared=shared or sought(found.last, record))
+    last = _settled(record, state, how)
+    if shared is None or last.fit.keep.sum() < state.fit.keep.sum():  # what is flagged now is no part of it any more
+        shared = sought(last, record)
+    found = Search(first, last, tuple(steps), not_tested, failed, record, shared)
     while doubted := overshadowed(found, len(declared)):
         places, why = doubted
         name = found.last.adopted[places[0]].name

@@ -59,7 +59,7 @@ def louder_in(keep: Mask, parts: Sequence[tuple[int, Array]]) -> Mask:
     for freedom, values in parts:
         rough = np.diff(values, axis=0, prepend=values[:1]) / np.sqrt(2.0)
         own, its = np.sum(values**2, axis=1), np.sum(rough**2, axis=1)
-        level = median_filter(its, size=ABOUT, mode="nearest")
+        level = median_filter(its, size=ABOUT, mode="mirror")
         limit = chdtri(freedom, FALSE_REJECTION / (count * len(parts))) / chdtri(freedom, 0.5)
         good &= own <= limit * np.maximum(level, np.median(its))
     return keep | good
@@ -85,7 +85,10 @@ def borne_out_in(keep: Mask, parts: Sequence[tuple[int, Array]]) -> Mask:
     count = len(keep)
     good = np.ones(count, dtype=bool)
     for freedom, values in parts:
-        apart = values - median_filter(values, size=(NEIGHBOURS, 1), mode="nearest")
+        about = median_filter(values, size=(NEIGHBOURS, 1), mode="nearest")
+        end = NEIGHBOURS // 2  # the first and the last have neighbours on one side: what is alone there has none either
+        about[:end], about[-end:] = about[end], about[-end - 1]
+        apart = values - about
         square = np.sum(apart**2, axis=1)
         limit = chdtri(freedom, FALSE_REJECTION / (count * len(parts))) / chdtri(freedom, 0.5)
         good &= square <= limit * np.median(square)

@@ -20,7 +20,7 @@ from magtensor.loop.gates import Candidate
 from magtensor.loop.gradient_shape import MODEL, gradient_share
 from magtensor.loop.latent import shared_words
 from magtensor.loop.model import Record, State
-from magtensor.loop.predictable import attitude_words
+from magtensor.loop.predictable import attitude_words, shortened_words
 from magtensor.loop.spectrum import spectral_lines
 
 ALPHA = 0.001  # of each of the tests
@@ -44,6 +44,7 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
     if line is not None:
         words.append(f"a line at {line[0]:.4g} Hz (period {1 / line[0]:.4g} s), {line[1]:.3g} nT rms")
     words.extend(attitude_words(state))
+    words.extend(shortened_words(state))
     words.extend(one.words for one in changing_matrices(state, ALPHA))
     gradient = gradient_share(state, record.position)
     if open_ := [c.model.name for c in suspects if c.passes]:

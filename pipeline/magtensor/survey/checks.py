@@ -382,6 +382,9 @@ def filled_in(field: Floats) -> Bools:
     single = np.array_equal(field, field.astype(np.float32), equal_nan=True)
     rounding = (SINGLE_PRECISION if single else DOUBLE_PRECISION) * np.nanmax(np.abs(field))
     bend = np.abs(after - 2.0 * now + before)
+    printed = _last_digit(field)
+    if 100.0 * printed < np.nanpercentile(bend, 95):  # finer than the noise: the line was rounded to it
+        rounding = max(rounding, 2.0 * printed)
     alike = (now == before) | (bend <= rounding)
     step = max(resolution(column) for column in field.T)
     moving = np.linalg.norm(after - before, axis=1) > 3.0 * step
@@ -395,7 +398,17 @@ def filled_in(field: Floats) -> Bools:
     if np.median(bent) < 5.0 * rounding:  # so smooth that three rows are nearly straight
         return none
     none[1:-1] = alike.all(axis=1)
+    none[-1] = (field[-1] == field[-2]).all()
     return none
+
+
+def _last_digit(field: Floats) -> float:
+    """A unit of the last decimal that all numbers were printed to, nT; 0 where they have more than four."""
+    largest = np.nanmax(np.abs(field))
+    for digits in range(5):
+        if np.nanmax(np.abs(field - np.round(field, digits))) <= DOUBLE_PRECISION * largest:
+            return float(10.0**-digits)
+    return 0.0
 
 
 def _at_once(together: float, each: Floats) -> float:
