@@ -38,6 +38,7 @@ _PARTS = 6  # of a band, in which the noise of different values may have differe
 QUIET = 5.0  # times the median square of a step: of a few dozen values none is as large by chance
 LEVEL_ROUNDS = 3
 LEAST_NOISE = 0.1  # of what the fit believes
+SINGLE_STRETCH = "it acts in a single short stretch, which no other can confirm"
 ONCE = 0.9  # of a waveform's power in a stretch as long as one that is held out
 SECOND = 0.1  # a second factor this strong beside the first: not one waveform
 
@@ -119,14 +120,14 @@ def sought(state: State, record: Record, *, may_follow: bool = False) -> Sought 
         objection = "with two sensors it cannot be told from a disturbance of one of them"
     elif n * float(seen @ seen) <= OF_THE_LAW * explained_before(state):
         objection = "it is less than 5 % of what is adopted, whose laws may leave it"
-    elif _acts_once(values):
-        objection = "it acts in a single short stretch, which no other can confirm"
     elif not gain.consistent:
         objection = "the sensors do not predict each other with it on held-out stretches"
     elif like is not None and not may_follow:
         objection = f"its waveform follows channel {like[0]}"
     elif left_by := effect_along(state, basis, seen):
         objection = f"the sensors feel it as they feel {left_by}, which may leave it"
+    elif _acts_once(values):
+        objection = SINGLE_STRETCH
     elif _second(test, basis, factors) > SECOND:
         objection = "one waveform does not explain what the sensors share"
     return Sought(

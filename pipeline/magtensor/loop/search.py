@@ -21,7 +21,7 @@ from magtensor.loop.exchange import looked_at_again, simpler
 from magtensor.loop.excitation import Excitation
 from magtensor.loop.found import Search, Step
 from magtensor.loop.gates import ALPHA, OF_THE_LAW, SECOND_ORDER, Candidate
-from magtensor.loop.latent import NAME, Sought, Source, renewed, sought, tried_source
+from magtensor.loop.latent import NAME, SINGLE_STRETCH, Sought, Source, renewed, sought, tried_source
 from magtensor.loop.log_noise import channels_of
 from magtensor.loop.model import Adopted, Fitting, Record, State, joint_state
 from magtensor.loop.needs import missing
@@ -115,7 +115,7 @@ def search(
         steps[-1] = replace(steps[-1], adopted=source.evidence, dropped=gone)
         standing = trial(record, state, how)
     last = _settled(record, state, how)
-    if shared is None or last.fit.keep.sum() < state.fit.keep.sum():  # what is flagged now is no part of it any more
+    if shared is None or shared.objection == SINGLE_STRETCH:  # it may be flagged now
         shared = sought(last, record)
     found = Search(first, last, tuple(steps), not_tested, failed, record, shared)
     while doubted := overshadowed(found, len(declared)):

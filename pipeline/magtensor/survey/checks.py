@@ -376,7 +376,7 @@ def filled_in(field: Floats) -> Bools:
         field: (N, 3) nT.
     """
     none = np.zeros(len(field), dtype=bool)
-    if len(field) < 20:
+    if np.isfinite(field).all(axis=1).sum() < 20:
         return none
     before, now, after = field[:-2], field[1:-1], field[2:]
     single = np.array_equal(field, field.astype(np.float32), equal_nan=True)
