@@ -256,7 +256,8 @@ def _prepared(
         np.column_stack([raw.reshape(len(raw), -1), total_field]).astype(np.float64).tofile(file)
         pick = even_blocks(len(raw), SELECTED // len(where))
         nodes = {name: node.to_dataset() for name, node in found.tree.children.items()}
-        chosen.append(nodes["array"].isel(time=pick))
+        shown_rows = nodes["array"].isel(time=pick)  # some windows may hold rows that were filled in, others not
+        chosen.append(shown_rows.assign(is_reading=(("time", "sensor"), found.readings_by_sensor[pick])))
         reference = reference if reference is not None else nodes.get("reference")
         attributes = attributes or dict(found.attributes)
         index.append(done + pick)

@@ -17,7 +17,7 @@ from magtensor.survey.model import Survey, Variable
 if TYPE_CHECKING:
     import xarray as xr
 
-ALWAYS_READABLE = ("time", "sensor", "axis", "good", "reading")
+ALWAYS_READABLE = ("time", "sensor", "axis", "good", "is_reading")
 
 
 @dataclass(frozen=True)

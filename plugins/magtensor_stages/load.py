@@ -16,8 +16,6 @@ from magtensor.survey.flags import Flag, flag_ranges
 from magtensor.survey.model import AXES, Survey
 
 BY = "load"
-
-
 _READ_TOGETHER = 0.5  # of the readings of the sensor that has the fewest
 
 
@@ -25,7 +23,7 @@ _READ_TOGETHER = 0.5  # of the readings of the sensor that has the fewest
     gives=("time", "sensor", "axis", "b_raw", "good"),
     may_give=(
         "position", "reference/time", "reference/total_field", "reference/world_field", "temperature", "current_*",
-        "acceleration", "angular_rate", "attitude", "segment", "reading",
+        "acceleration", "angular_rate", "attitude", "segment", "is_reading",
     ),
 )  # fmt: skip
 def load(
@@ -335,7 +333,7 @@ def _readings(survey: Survey, notes: list[str]) -> dict[str, Any]:
         notes.append(f"{words}; the sensors are read in different rows, and all are used")
         return {}
     notes.append(f"{words}; no calibration is fitted to them")
-    return {"reading": (("time", "sensor"), reading, {"long_name": "a reading, neither repeated nor interpolated"})}
+    return {"is_reading": (("time", "sensor"), reading, {"long_name": "a reading, neither repeated nor interpolated"})}
 
 
 def _described(survey: Survey) -> dict[str, Any]:

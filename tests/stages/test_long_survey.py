@@ -102,6 +102,20 @@ def test_a_run_in_windows_gives_what_the_whole_gives(folder: Path) -> None:
     assert not [p for p in (folder / "parts").iterdir() if p.name.startswith((".", "tmp"))]
 
 
+def test_windows_of_which_one_holds_filled_in_rows(folder: Path, tmp_path: Path) -> None:
+    """No calibration is fitted to them, in windows or on the whole."""
+    survey = written(tmp_path / "c.h5", 4)
+    with h5py.File(survey, "r+") as file:
+        held = np.repeat(file["b_raw"][20_000::2], 2, axis=0)
+        file["b_raw"][20_000:] = held[: SAMPLES - 20_000]
+    found = {}
+    for name, options in (("windows", ["--memory", "0.01"]), ("whole", [])):
+        magtensor("run", folder / "recipe.yaml", "--input", survey, "--output", tmp_path / name, *options)
+        found[name] = opened(tmp_path / name / "calibration.nc")["calibration"]
+    assert (found["windows"]["noise_std"].values < 0.25).all()
+    np.testing.assert_allclose(found["windows"]["matrix"], found["whole"]["matrix"], atol=2e-6)
+
+
 def test_a_result_made_in_windows_is_made_again_in_windows(folder: Path) -> None:
     first = ("run", folder / "recipe.yaml", "--input", folder / "a.h5", "--output", folder / "first")
     assert "--memory 0.1 cannot be kept to" in magtensor(*first, "--memory", 0.1)

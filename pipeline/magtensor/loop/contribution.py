@@ -10,7 +10,6 @@ import numpy as np
 from magtensor.calibration.types import Array
 from magtensor.loop.assessment import WHITE, Colours, block_count
 from magtensor.loop.evidence import Grams, grams
-from magtensor.loop.gates import LEAST_REDUCTION
 from magtensor.loop.model import Adopted, Fitting, Record, State, joint_state
 from magtensor.loop.residual import Residual, taken_off
 from magtensor.loop.settings import EventTimes, profiled
@@ -19,6 +18,7 @@ from magtensor.loop.terms import Terms
 from magtensor.loop.trial import WORST_RISE
 from magtensor.loop.waveform import NAME
 
+LEAST_FALL = 5e-4  # of the error on held-out blocks, by what lasts: 3 % of the noise is no effect anybody would miss
 KEEP_ALPHA = 0.01  # an adopted effect that is no longer significant at this level is dropped
 
 
@@ -95,11 +95,11 @@ def eliminate(record: Record, state: State, how: Fitting, fixed: int) -> tuple[S
 def _rise(state: State, place: int) -> float:
     """The factor by which an adopted model raises the error on held-out blocks, over what it may.
 
-    It has to lower the error by what the second gate asks. Of what happened once the blocks where it did say little,
+    What lasts has to lower it. Of what happened once the blocks where it did say little,
     and what holds a waveform has its noise: both may raise it somewhat.
     """
     before, after = removal(state, place)
-    return after / before / (1.0 - LEAST_REDUCTION / 2.0 if _lasts(state.adopted[place]) else 1.0 + WORST_RISE)
+    return after / before / (1.0 - LEAST_FALL if _lasts(state.adopted[place]) else 1.0 + WORST_RISE)
 
 
 def _lasts(model: Adopted) -> bool:

@@ -18,7 +18,7 @@ AMONG_ITS_SETTINGS = 0.05  # the same, that the test with the best of a model's 
 UNLIKELY = 0.02  # of the family-wise probability: asked for in noise of the residual's own colour
 SECOND_ORDER = 1e-5  # of the sum of squares that is explained: 0.3 % of an effect's size
 OF_THE_LAW = 0.0025  # the same, that the law of an effect may miss: 5 % of its size
-LEAST_REDUCTION = 1e-3  # of the held-out sum of squares: 3 % of the noise is no effect that a survey would miss
+LEAST_REDUCTION = 1e-4  # of the held-out sum of squares: smaller is significant only in very long surveys
 LOG_MARGIN = 1.5  # the noise of a log is known to some per cent
 LOG_DEVIATIONS = 3.0  # of what coefficients gain of it by chance
 

@@ -65,7 +65,7 @@ def shortened_words(state: State) -> list[str]:
     x, residual = state.excitation, state.residual
     rate = x.rate if x.rate.ndim == 2 else x.rate.mean(axis=1)
     series = np.sum(rate**2, axis=1) / np.linalg.norm(x.field[:, 0], axis=1)
-    if residual.along is None or series.std() <= 1e-6 * np.abs(x.field).max():
+    if residual.along is None or not np.ptp(series) > 0:
         return []
     part = _predictable(state, x.on_reference(series, "s2", "rate"))
     if part == 0.0:

@@ -33,7 +33,7 @@ LAYOUT: dict[str, tuple[tuple[tuple[str, ...], ...], str | None]] = {
 }
 _CURRENT = ((("time",),), "A")
 # what stages give; no channel may have these names
-RESULTS = ("good", "reading", "total_field", "total_field_std", "diurnal")
+RESULTS = ("good", "is_reading", "total_field", "total_field_std", "diurnal")
 LENGTHS = {"axis": 3, "quaternion": 4}
 
 

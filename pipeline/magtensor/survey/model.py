@@ -153,8 +153,8 @@ class Survey:
     def readings_by_sensor(self) -> NDArray[np.bool_]:
         """(N, S) True where the sensor's sample may be used and is a reading, none that was repeated or interpolated to
         fill a row: what a calibration is fitted to."""
-        if "reading" in self:
-            return np.asarray(self.good_by_sensor & self.values("reading"))
+        if "is_reading" in self:
+            return np.asarray(self.good_by_sensor & self.values("is_reading"))
         return self.good_by_sensor
 
     @property
@@ -165,7 +165,7 @@ class Survey:
     def made_from(self, bad: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """(N,) bad readings, and the rows that were filled in from one of them."""
         at = np.flatnonzero(self.readings)
-        if "reading" not in self or not bad.any() or not len(at):
+        if "is_reading" not in self or not bad.any() or not len(at):
             return bad
         row = np.arange(len(bad))
         before = at[np.maximum(np.searchsorted(at, row, side="right") - 1, 0)]
