@@ -37,8 +37,7 @@ def sampling_lag(
     Minus the rate of change of the output; the coefficient is the delay. A delay common to all sensors is a rotation
     of the field and shows only against a reference. Rivals: `eddy_current`, which contains it; `bandwidth`.
     """
-    late = -x.sensed(x.rate)
-    return x.responses(late, "s", "lag ") if per_axis else x.one_each(late, "s", "lag")
+    return x.late(np.ones(len(x.time)), "s", "lag", per_axis=per_axis)
 
 
 @error_model(
@@ -99,7 +98,7 @@ def clock_drift(x: Excitation) -> Terms:
     Time since the start times the rate of change of the output; one coefficient a sensor. A drift common to all
     sensors shows only against a reference.
     """
-    return x.one_each(1e-6 * x.elapsed[:, None, None] * x.sensed(x.rate), "ppm", "drift")
+    return x.late(-1e-6 * x.elapsed, "ppm", "drift")
 
 
 @error_model(

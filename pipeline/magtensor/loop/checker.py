@@ -19,6 +19,7 @@ import numpy as np
 from magtensor.calibration.types import Array, ArrayCalibration
 from magtensor.components import Component, PluginError, component_of
 from magtensor.loop.correction import corrected_raw
+from magtensor.loop.delays import cleared
 from magtensor.loop.example import example_survey
 from magtensor.loop.excitation import Excitation
 from magtensor.loop.model import Adopted, Record
@@ -244,7 +245,7 @@ def _round_trip(component: Component, x: Excitation, settings: Mapping[str, Any]
     strength = np.array([np.sqrt(np.mean(terms.contribution(unit, outputs) ** 2)) for unit in np.eye(terms.count)])
     unlike = np.sqrt(2.0) * np.cos(2.4 * np.arange(terms.count))  # what all sensors share would be a field
     theta = DISTORTION_NT / strength / np.sqrt(terms.count) * unlike
-    distorted = x.output + terms.contribution(theta, outputs).reshape(x.output.shape)
+    distorted = cleared(x.output, x.time, x.run, [terms], [-theta])
     offset = (x.output - x.sensed(x.field)).mean(axis=0)
     inverse = np.asarray(np.linalg.inv(x.matrix), dtype=float)
     linear = ArrayCalibration(inverse, offset, np.full((4 * outputs, 4 * outputs), np.nan), "platform")

@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 from magtensor.calibration.by_sensor import by_sensor
 from magtensor.calibration.types import Array, ArrayCalibration
 from magtensor.loop.another_survey import as_begun_here
+from magtensor.loop.delays import cleared
 from magtensor.loop.model import Adopted, Record, State, without
+from magtensor.loop.terms import Terms
 from magtensor.loop.waveform import NAME, course_of
 from magtensor.tensor.geometry import array_design
 
@@ -28,20 +30,21 @@ def corrected_raw(
 ) -> Array:
     """Raw outputs (N, S, 3) nT without the instrument's effects.
 
-    The effects depend on the field that is being sought: b is found from the outputs as they are, the effects from
-    b, and so on until neither moves. Effects of the site belong to the calibration's place and are left alone here.
+    Outputs that come late are brought back to their time. The other effects depend on the field that is being sought: b
+    is found from the outputs as they are, the effects from b, and so on until neither moves. Effects of the site belong
+    to the calibration's place and are left alone here.
 
     Parameters
     ----------
     record: all samples of the survey, channels with the calibration's means taken off.
     calibration: C and o.
     adopted: the effects; theta: their coefficients.
-    good: (N,) samples from which the waveform of a source that nobody logged may be found.
+    good: (N,) samples from which others may be interpolated and the waveform of a source that nobody logged be found.
     """
     hidden = _hidden(adopted)
     if hidden is not None:
         others = [i for i in range(len(adopted)) if i != hidden]
-        left = corrected_raw(record, calibration, [adopted[i] for i in others], [theta[i] for i in others])
+        left = corrected_raw(record, calibration, [adopted[i] for i in others], [theta[i] for i in others], good)
         noise = _weights(adopted[hidden], record.raw[0].size)
         waveform = hidden_waveform(left, calibration, record.position, theta[hidden], noise, good)
         record = replace(record, waveform=waveform)
@@ -49,15 +52,24 @@ def corrected_raw(
     raw = record.raw
     if not own:
         return raw
-    own = as_begun_here(record, calibration, own)
     forward = np.linalg.inv(calibration.matrix)
-    for _ in range(MOST_STEPS):
+
+    def terms_for(raw: Array, models: Sequence[Adopted]) -> list[Terms]:
         b = calibration.apply(raw)
         output = by_sensor(forward, b) + calibration.offset
         x = record.excitation(_whole(output), _whole(b), matrix=np.asarray(forward, dtype=float))
-        after = record.raw
-        for model, coefficients in own:
-            after = after - model.terms(x).contribution(coefficients, raw.shape[1] * 3).reshape(raw.shape)
+        return [model.terms(x) for model in models]
+
+    each = terms_for(raw, [model for model, _ in own])
+    late = [(terms, t) for terms, (_, t) in zip(each, own, strict=True) if terms.delay is not None]
+    if late:
+        raw = cleared(raw, record.time, record.run, [terms for terms, _ in late], [t for _, t in late], good)
+        record = replace(record, raw=raw)
+        own = [pair for terms, pair in zip(each, own, strict=True) if terms.delay is None]
+    own = as_begun_here(record, calibration, own)
+    models, theta = [model for model, _ in own], [t for _, t in own]
+    for _ in range(MOST_STEPS if own else 0):
+        after = cleared(record.raw, record.time, record.run, terms_for(raw, models), theta)
         moved = float(np.nanmax(np.abs(after - raw), initial=0.0))
         raw = after
         if moved < SETTLED_NT:

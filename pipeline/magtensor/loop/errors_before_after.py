@@ -13,7 +13,7 @@ from magtensor.calibration.by_sensor import by_sensor
 from magtensor.calibration.joint import nearest_frame
 from magtensor.calibration.types import Array
 from magtensor.errors import DataError, NotEnoughData
-from magtensor.loop.model import Adopted, Fitting, Record, State, excitation_of, joint_state, without
+from magtensor.loop.model import Adopted, Fitting, Record, State, joint_state, without
 from magtensor.loop.terms import Terms
 from magtensor.sharing import shared_out
 from magtensor.tensor.assembly import least_squares_assembly
@@ -81,8 +81,7 @@ def held_out_error(
             state = joint_state(record, adopted, how, start, keep=train)
         except DataError:
             return None
-        x = excitation_of(record, state.fit)
-        raw, field = without(record, [a.terms(x) for a in adopted], state.theta)
+        raw, field = without(record, [a.terms(state.excitation) for a in adopted], state.theta)
         matrix = np.linalg.inv(state.fit.forward @ nearest_frame(state.fit.forward))
         return by_sensor(matrix, raw[test] - state.fit.offset), None if field is None else field[test]
 

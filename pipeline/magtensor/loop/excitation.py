@@ -362,6 +362,12 @@ class Excitation:
         outputs = np.arange(3 * s)
         return Terms((name,) * s, self.sensors, (units,) * s, columns, outputs // 3, outputs, outputs)
 
+    def late(self, course: Array, units: str, name: str, *, per_axis: bool = False) -> Terms:
+        """Outputs late by a coefficient times a course (N,), s: one coefficient a sensor, or one an axis."""
+        series = -np.asarray(course, dtype=float)[:, None, None] * self.sensed(self.rate)
+        terms = self.responses(series, units, f"{name} ") if per_axis else self.one_each(series, units, name)
+        return replace(terms, delay=np.repeat(course[:, None], terms.series.shape[1], axis=1))
+
     def shared(self, series: Array, units: str, name: str) -> Terms:
         """One coefficient for a pattern (N, S, 3) over all sensors."""
         columns = np.asarray(series, dtype=float).reshape(len(self.time), -1)

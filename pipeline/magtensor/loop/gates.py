@@ -37,6 +37,7 @@ class Candidate:
         alpha: what the adjusted p has to stay below.
         log_noise: what noise in the log of its channel, brought in by a model adopted before, lets it gain.
         beside: sum of squares that the models adopted before explain.
+        before: what it was judged against, where that is the fit with it, its part put back (`own_fit`).
     """
 
     model: Adopted
@@ -48,6 +49,7 @@ class Candidate:
     alpha: float = ALPHA
     log_noise: float = 0.0
     beside: float = 0.0
+    before: State | None = None
 
     @property
     def of_the_log(self) -> bool:

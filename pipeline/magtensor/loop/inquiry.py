@@ -23,6 +23,7 @@ from magtensor.loop.long_record import on_every_sample, part_of
 from magtensor.loop.model import Adopted, Fitting, Record, State, joint_state, without
 from magtensor.loop.needs import missing
 from magtensor.loop.outcome import described
+from magtensor.loop.own_fit import at_their_own_fit
 from magtensor.loop.profiling import repeatable
 from magtensor.loop.record import record_of
 from magtensor.loop.screening import candidates_of
@@ -163,7 +164,8 @@ class Inquiry:
             failed: dict[str, str] = {}
             models = [m for m in self.open_models() if m.name != NAME]
             state = with_lines(self.now.state, self.now.record, self._part.lines)
-            self._ranked = tuple(candidates_of(state, models, failed, self.alpha))
+            found = candidates_of(state, models, failed, self.alpha)
+            self._ranked = tuple(at_their_own_fit(found, self.now.record, state, self.how))
             self._history[-1] = replace(self.now, failed={**(self.now.failed or {}), **failed})
         return self._ranked
 

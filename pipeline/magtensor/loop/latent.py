@@ -25,7 +25,7 @@ from magtensor.loop.factor import Factors, Groups, noise_alone, with_factor
 from magtensor.loop.gates import OF_THE_LAW, Candidate, explained_before, gained_of_a_log
 from magtensor.loop.likeness import effect_along, followed
 from magtensor.loop.log_noise import brought_in
-from magtensor.loop.model import Adopted, Fitting, Record, State, excitation_of, joint_state, without
+from magtensor.loop.model import Adopted, Fitting, Record, State, joint_state
 from magtensor.loop.residual import Residual
 from magtensor.loop.statistics import FOLDS, Gain
 from magtensor.loop.terms import joined
@@ -396,9 +396,7 @@ def _turning(record: Record, state: State) -> bool:
     assert found is not None
     across, direction = found
     series = across @ direction
-    raw, _ = without(record, [a.terms(state.excitation) for a in state.adopted], state.theta)
-    clean = attitude_series(excitation_of(replace(record, raw=raw), state.fit))
-    columns = np.column_stack([state.residual.affine, clean[state.residual.samples]])
+    columns = np.column_stack([state.residual.affine, attitude_series(state.excitation)[state.residual.samples]])
     n = len(series)
     if n < 4 * columns.shape[1]:
         return False

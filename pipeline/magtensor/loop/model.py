@@ -19,6 +19,7 @@ from magtensor.calibration.types import Array
 from magtensor.components import Component
 from magtensor.errors import NotEnoughData, UsageError
 from magtensor.loop.assessment import Colours, colours_of, estimated, log_likelihood
+from magtensor.loop.delays import cleared
 from magtensor.loop.excitation import Excitation
 from magtensor.loop.residual import Residual, quick, residual_of, taken_off
 from magtensor.loop.station import Station
@@ -240,7 +241,7 @@ def joint_state(
     for round_ in range(MOST_ROUNDS):
         fit = _fit(record, raw, reference, how, keep, known if round_ + 1 < MOST_ROUNDS else None)
         known = fit.coverage  # between the first fit and the last nobody asks
-        x = excitation_of(record, fit, lines)
+        x = excitation_of(record, fit, raw, lines)
         if not adopted:
             break
         each = [a.terms(x) for a in adopted]
@@ -249,7 +250,7 @@ def joint_state(
             if any(t.any() for t in theta):
                 raw, reference = without(record, each, theta)
                 fit = _fit(record, raw, reference, how, keep)
-                x = excitation_of(record, fit, lines)
+                x = excitation_of(record, fit, raw, lines)
                 each = [a.terms(x) for a in adopted]
         residual = quick(residual_of(fit, raw, reference, how.reference_noise))
         terms = joined(each).at(residual.samples)
@@ -265,7 +266,7 @@ def joint_state(
         step = np.abs(after - before) / np.sqrt(np.maximum(np.diag(estimate.covariance), 1e-300))
         if np.max(step, initial=0.0) < SETTLED:
             fit = _fit(record, raw, reference, how, keep)
-            x = excitation_of(record, fit, lines)
+            x = excitation_of(record, fit, raw, lines)
             break
     if estimate is not None:
         shown = without_noise(np.concatenate(theta), estimate)
@@ -273,7 +274,7 @@ def joint_state(
             theta = np.split(shown, edges)
             raw, reference = without(record, each, theta)
             fit = _fit(record, raw, reference, how, keep)
-            x = excitation_of(record, fit, lines)
+            x = excitation_of(record, fit, raw, lines)
     entire = residual_of(fit, raw, reference, how.reference_noise)
     residual = quick(entire)
     if adopted:
@@ -367,19 +368,23 @@ def with_colour(record: Record, state: State, how: Fitting) -> State:
 
 def without(record: Record, each: Sequence[Terms], theta: Sequence[Array]) -> tuple[Array, Array | None]:
     """Raw outputs and total field with the terms' contributions taken off."""
-    raw, reference = record.raw, record.total_field
-    for terms, coefficients in zip(each, theta, strict=True):
-        raw = raw - terms.contribution(coefficients, raw.shape[1] * 3).reshape(raw.shape)
-        if reference is not None:
+    raw, reference = cleared(record.raw, record.time, record.run, each, theta), record.total_field
+    if reference is not None:
+        for terms, coefficients in zip(each, theta, strict=True):
             reference = reference - terms.on_reference(coefficients)
     return raw, reference
 
 
-def excitation_of(record: Record, fit: JointFit, lines: Sequence[float] = ()) -> Excitation:
+def excitation_of(record: Record, fit: JointFit, raw: Array, lines: Sequence[float] = ()) -> Excitation:
     """Modelled outputs and field of every sample from the common field of a fit, of the length that is known: the noise
-    in what is seen of it is what the total field's residual is made of, and models would find it there."""
+    in what is seen of it is what the total field's residual is made of, and models would find it there.
+
+    Parameters
+    ----------
+    raw: (N, S, 3) nT, that the fit was made from: a strong effect on one sensor would else be in the common field.
+    """
     q = nearest_frame(fit.forward)
-    b = fit.scalar.field(fit.plane.coordinates(record.raw)) if fit.posterior is None else fit.posterior.field
+    b = fit.scalar.field(fit.plane.coordinates(raw)) if fit.posterior is None else fit.posterior.field
     if record.total_field is not None:
         b = b * (record.total_field / np.linalg.norm(b, axis=1))[:, None]
     output = by_sensor(fit.forward, b) + fit.offset

@@ -26,6 +26,7 @@ from magtensor.loop.log_noise import channels_of
 from magtensor.loop.model import Adopted, Fitting, Record, State, joint_state
 from magtensor.loop.needs import missing
 from magtensor.loop.overshadowed import overshadowed
+from magtensor.loop.own_fit import at_their_own_fit
 from magtensor.loop.profiling import already, repeatable
 from magtensor.loop.screening import candidates_of, generic
 from magtensor.loop.separation import SEPARATION, fold_gain, separated
@@ -79,6 +80,7 @@ def search(
         if len(state.adopted) - len(declared) >= most_effects or state.residual.square() < ROUNDING:
             break
         candidates = candidates_of(state, open_models(testable, state), failed, alpha)
+        candidates = at_their_own_fit(candidates, record, state, how)
         adopted = _first_kept(record, standing, candidates, how, len(declared), say)
         steps.append(Step(state, tuple(candidates), *adopted.step))
         if adopted.standing is not None:
@@ -126,6 +128,7 @@ def search(
         record, state = renewed(record, without_models(record, found.last, places, how), how)
         state = with_lines(state, record, lines)
         candidates = candidates_of(state, open_models(testable, state), failed, alpha)
+        candidates = at_their_own_fit(candidates, record, state, how)
         steps.append(Step(state, tuple(candidates), None, refused={name: why}))
         last = _settled(record, state, how)
         found = replace(found, last=last, steps=tuple(steps), record=record, shared=sought(last, record))
@@ -297,8 +300,9 @@ def _containing(best: Candidate, possible: Sequence[Candidate], state: State) ->
     more = [c for c in possible if c.assessment.gain.total > best.assessment.gain.total + SEPARATION]
     for other in sorted(more, key=lambda c: -c.assessment.gain.total):
         colours = other.assessment.colours
-        alone = fold_gain(state, colours, other.terms)
-        if fold_gain(state, colours, other.terms, best.terms).total - alone.total < SEPARATION:
+        before = other.before or state
+        alone = fold_gain(before, colours, other.terms)
+        if fold_gain(before, colours, other.terms, best.terms).total - alone.total < SEPARATION:
             return other
     return best
 
@@ -315,13 +319,13 @@ def simplest(best: Candidate, possible: Sequence[Candidate], state: State) -> tu
     A model that slow noise could explain is named, and not chosen before one that it could not.
     """
     colours = best.assessment.colours
-    reference = fold_gain(state, colours, best.terms)
+    reference = fold_gain(best.before or state, colours, best.terms)
     equal: list[Candidate] = [best]
     for other in possible:
         if other is best:
             continue
         spare = max(other.assessment.estimate.rank - best.assessment.estimate.rank, 0)
-        found = fold_gain(state, colours, other.terms)
+        found = fold_gain(other.before or state, colours, other.terms)
         named = generic(best.model) and not generic(other.model) and _channel(best) == _channel(other)
         behind = reference.over(found).total
         alike = behind <= (OF_THE_LAW if named else SECOND_ORDER) * reference.total

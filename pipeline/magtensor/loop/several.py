@@ -24,6 +24,7 @@ from magtensor.calibration.surveys.samples import Samples
 from magtensor.calibration.types import Array
 from magtensor.errors import DataError, NotEnoughData
 from magtensor.loop.assessment import Colours, colours_of, estimated
+from magtensor.loop.delays import cleared
 from magtensor.loop.excitation import Excitation
 from magtensor.loop.model import MOST_ROUNDS, SETTLED, Adopted, Record, share_of
 from magtensor.loop.residual import Levels, Residual, Sighted
@@ -92,7 +93,7 @@ def surveys_state(of: Together) -> SurveysState:
         before = theta if len(theta) else np.zeros(terms.count)
         share = share_of(residual, terms, estimate.theta, colours)
         theta = estimate.seen(before) + share * estimate.theta  # what no data show stays zero
-        samples = _without(of.samples, joined(each), theta)
+        samples = _without(of, each, np.split(theta, np.cumsum([e.count for e in each])[:-1]))
         if np.max(np.abs(theta - before) / np.sqrt(np.maximum(np.diag(estimate.covariance), 1e-300))) < SETTLED:
             if not more:
                 break
@@ -220,7 +221,14 @@ def _excitation(of: Together, samples: Samples, fit: SurveysFit, survey: int) ->
     return of.records[survey].excitation(output, common, matrix=forward / factor)
 
 
-def _without(samples: Samples, terms: Terms, theta: Array) -> Samples:
+def _without(of: Together, each: Sequence[Terms], theta: Sequence[Array]) -> Samples:
     """Outputs and total field with the effects taken off."""
-    taken = terms.contribution(theta, samples.raw[0].size).reshape(samples.raw.shape)
-    return replace(samples, raw=samples.raw - taken, total_field=samples.total_field - terms.on_reference(theta))
+    samples = of.samples
+    time = np.concatenate([record.time for record in of.records])
+    runs = [record.run - record.run[0] for record in of.records]
+    firsts = np.cumsum([0, *(run[-1] + 1 for run in runs)])
+    run = np.concatenate([run + first for run, first in zip(runs, firsts[:-1], strict=True)])
+    total_field = samples.total_field
+    for terms, coefficients in zip(each, theta, strict=True):
+        total_field = total_field - terms.on_reference(coefficients)
+    return replace(samples, raw=cleared(samples.raw, time, run, each, theta), total_field=total_field)

@@ -24,6 +24,8 @@ class Terms:
         series: (N, K) distinct regressors, nT per unit of the coefficient.
         part_term, part_output, part_series: (Q,) each part adds coefficient times series to an output, numbered
             3 * sensor + axis, or REFERENCE.
+        delay: (N, K) s by which a unit of the coefficient makes outputs late, of which the series is what that adds to
+            first order; None where series are added as they are.
     """
 
     names: tuple[str, ...]
@@ -33,6 +35,7 @@ class Terms:
     part_term: NDArray[np.int_]
     part_output: NDArray[np.int_]
     part_series: NDArray[np.int_]
+    delay: Array | None = None
 
     @property
     def count(self) -> int:
@@ -40,11 +43,18 @@ class Terms:
         return len(self.names)
 
     def contribution(self, coefficients: Array, outputs: int) -> Array:
-        """(N, outputs) nT that the coefficients (P,) add to the raw outputs."""
-        weights = np.zeros((self.series.shape[1], outputs))
+        """(N, outputs) nT that the coefficients (P,) add to the raw outputs, of a delay to first order."""
+        return self._on_outputs(self.series, coefficients, outputs)
+
+    def lateness(self, coefficients: Array, outputs: int) -> Array | None:
+        """(N, outputs) s by which the coefficients (P,) make the raw outputs late; None of what is no delay."""
+        return None if self.delay is None else self._on_outputs(self.delay, coefficients, outputs)
+
+    def _on_outputs(self, series: Array, coefficients: Array, outputs: int) -> Array:
+        weights = np.zeros((series.shape[1], outputs))
         raw = self.part_output >= 0
         np.add.at(weights, (self.part_series[raw], self.part_output[raw]), coefficients[self.part_term[raw]])
-        out: Array = self.series @ weights
+        out: Array = series @ weights
         return out
 
     def on_reference(self, coefficients: Array) -> Array:
@@ -57,7 +67,8 @@ class Terms:
 
     def at(self, samples: NDArray[np.int_]) -> Terms:
         """The same at some of the samples."""
-        return replace(self, series=self.series[samples])
+        delay = None if self.delay is None else self.delay[samples]
+        return replace(self, series=self.series[samples], delay=delay)
 
     def like(self, other: Terms) -> bool:
         """Whether the two differ in their series only, names and units apart."""
@@ -77,6 +88,7 @@ class Terms:
             np.array([place[int(self.part_term[i])] for i in parts], dtype=int),
             self.part_output[parts],
             self.part_series[parts],
+            self.delay,
         )
 
 
@@ -96,7 +108,9 @@ def stacked(parts: Sequence[Terms]) -> Terms:
                 for p in (first, part)
             ]
             raise ValueError(f"its coefficients are {told[0]} on one survey and {told[1]} on another")
-    return replace(first, series=np.concatenate([p.series for p in parts]))
+    delays = [p.delay for p in parts if p.delay is not None]
+    delay = np.concatenate(delays) if delays else None
+    return replace(first, series=np.concatenate([p.series for p in parts]), delay=delay)
 
 
 def _places(terms: Terms) -> tuple[NDArray[np.int_], ...]:
@@ -104,7 +118,7 @@ def _places(terms: Terms) -> tuple[NDArray[np.int_], ...]:
 
 
 def joined(parts: list[Terms]) -> Terms:
-    """All terms of several models, one after the other."""
+    """All terms of several models, one after the other, each to first order."""
     if len(parts) == 1:
         return parts[0]
     terms = np.cumsum([0, *(p.count for p in parts)])
