@@ -9,6 +9,7 @@ from magtensor.components import error_model
 from magtensor.loop.excitation import Excitation
 from magtensor.loop.settings import Beginning, Choice, Range
 from magtensor.loop.terms import Terms
+from magtensor_effects.ageing import EventTime, Span
 
 FieldAtStart = Annotated[
     float,
@@ -22,7 +23,7 @@ FieldAtStart = Annotated[
 @error_model(
     "instrument",
     needs=("rotation",),
-    source="first-order Taylor series; timing shifts as in Alken (DMSP) and Styp-Rekowski et al. 2021 (GRACE-FO)",
+    source="the field at the earlier instant; timing shifts as in Alken (DMSP) and Styp-Rekowski et al. 2021 (GRACE-FO)",
     typical="25 nT for 1 ms at 0.5 rad/s in 50 000 nT",
 )
 def sampling_lag(
@@ -34,7 +35,7 @@ def sampling_lag(
 ) -> Terms:
     """Each sensor, or each axis, is sampled late by a constant time.
 
-    Minus the rate of change of the output; the coefficient is the delay. A delay common to all sensors is a rotation
+    The coefficient is the delay; what it adds is, to first order, minus the rate of change of the output. A delay common to all sensors is a rotation
     of the field and shows only against a reference. Rivals: `eddy_current`, which contains it; `bandwidth`.
     """
     return x.late(np.ones(len(x.time)), "s", "lag", per_axis=per_axis)
@@ -89,13 +90,28 @@ def bandwidth(
 @error_model(
     "instrument",
     needs=("rotation",),
-    source="first-order Taylor series",
+    source="the field at the earlier instant",
+    typical="one sampling interval: 2500 nT for 0.1 s at 0.5 rad/s",
+)
+def lag_step(x: Excitation, *, time_s: EventTime = 0.0, span_s: Span = 3600.0) -> Terms:
+    """A sensor's samples come late, or early, from a time on: its stream has lost a sample, or holds one twice.
+
+    One coefficient a sensor, the delay; several slips are several models of this name. Recorders begin in step again,
+    so the slip is none beyond span_s. Rivals: `sampling_lag` for a slip near the beginning, `clock_drift` for many.
+    """
+    return x.late(((x.elapsed >= time_s) & (x.elapsed <= span_s)).astype(float), "s", "lag")
+
+
+@error_model(
+    "instrument",
+    needs=("rotation",),
+    source="the field at the earlier instant",
     typical="1 ppm over 1 h is 3.6 ms, 90 nT at 0.5 rad/s",
 )
 def clock_drift(x: Excitation) -> Terms:
     """Each sensor's logger has a clock of its own that runs fast: a sample stamped t was taken at t (1 + drift).
 
-    Time since the start times the rate of change of the output; one coefficient a sensor. A drift common to all
+    A delay in proportion to the time since the start; one coefficient a sensor. A drift common to all
     sensors shows only against a reference.
     """
     return x.late(-1e-6 * x.elapsed, "ppm", "drift")

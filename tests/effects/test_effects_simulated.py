@@ -194,6 +194,13 @@ def test_a_slow_filter_is_told_from_a_delay() -> None:
     assert fitted("bandwidth", {"tau_s": 1e-3}, slow, after_s=5.0)[0].left > 0.15
 
 
+def test_a_slip_by_a_sample_from_a_time_on() -> None:
+    lag = [[a, a, a] for a in (0.1, 0.0, 0.0, -0.04)]
+    fit, survey, _ = fitted("lag_step", {"time_s": 70.0}, {"lag_s": lag, "time_s": 70.0})
+    found = [fit.coefficients["lag", s] for s in survey.sensors]
+    np.testing.assert_allclose(found, [row[0] for row in lag], atol=2e-3)  # to first order
+
+
 def test_clock_drift_in_ppm() -> None:
     fit, survey, _ = fitted("clock_drift", {}, {"ppm": [20.0, -5.0, 3.0, -9.0]})
     assert fit.left < 0.005  # second order: a delay of up to 4 ms

@@ -59,7 +59,7 @@ def test_terms_add_up() -> None:
 def models_terms(record: Record) -> Terms:
     """Offsets, scales, a matrix, a pattern over all sensors and the reference: every way in which effects act."""
     fit = fit_joint(record.raw, record.total_field, noise=np.full(record.raw.shape[1:], 1.0))
-    x = excitation_of(record, fit)
+    x = excitation_of(record, fit, record.raw)
     t = np.linspace(-1, 1, len(record.time))
     return joined(
         [
@@ -215,7 +215,7 @@ def test_sets_of_terms_are_scored_together_as_each_is_alone() -> None:
     """Whatever is in already, and in noise of any colour: by the explained sum of squares of a fit to each."""
     record = synthetic(9, samples=300, sensors=3)
     fit = fit_joint(record.raw, record.total_field, noise=np.ones((3, 3)))
-    residual, x = residual_of(fit, record.raw, record.total_field), excitation_of(record, fit)
+    residual, x = residual_of(fit, record.raw, record.total_field), excitation_of(record, fit, record.raw)
     t = np.linspace(-1.0, 1.0, 300)
     given = x.offsets(t**3, "nT")
     several = [

@@ -38,6 +38,7 @@ EVERY: dict[str, dict[str, Any]] = {
     "scale_step": {"time_s": [20.0, 45.0]},
     "turn_step": {"time_s": 20.0},
     "sampling_lag": {"per_axis": True},
+    "lag_step": {"time_s": 20.0},
     "eddy_current": {},
     "bandwidth": {},
     "clock_drift": {},

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from magtensor.calibration.by_sensor import by_sensor
 from magtensor.calibration.types import Array, ArrayCalibration
 from magtensor.loop.another_survey import as_begun_here
-from magtensor.loop.delays import cleared
+from magtensor.loop.delays import cleared, lateness, on_time, unseen
 from magtensor.loop.model import Adopted, Record, State, without
 from magtensor.loop.terms import Terms
 from magtensor.loop.waveform import NAME, course_of
@@ -30,9 +30,9 @@ def corrected_raw(
 ) -> Array:
     """Raw outputs (N, S, 3) nT without the instrument's effects.
 
-    Outputs that come late are brought back to their time. The other effects depend on the field that is being sought: b
-    is found from the outputs as they are, the effects from b, and so on until neither moves. Effects of the site belong
-    to the calibration's place and are left alone here.
+    Outputs that come late are brought back to their time; what was not recorded before an end is missing then. The
+    other effects depend on the field that is being sought: b is found from the outputs as they are, the effects from b,
+    and so on until neither moves. Effects of the site belong to the calibration's place and are left alone here.
 
     Parameters
     ----------
@@ -61,11 +61,9 @@ def corrected_raw(
         return [model.terms(x) for model in models]
 
     each = terms_for(raw, [model for model, _ in own])
-    late = [(terms, t) for terms, (_, t) in zip(each, own, strict=True) if terms.delay is not None]
-    if late:
-        raw = cleared(raw, record.time, record.run, [terms for terms, _ in late], [t for _, t in late], good)
-        record = replace(record, raw=raw)
-        own = [pair for terms, pair in zip(each, own, strict=True) if terms.delay is None]
+    record = replace(record, raw=_on_time(record, each, [t for _, t in own], good))
+    raw = record.raw
+    own = [pair for terms, pair in zip(each, own, strict=True) if terms.delay is None]
     own = as_begun_here(record, calibration, own)
     models, theta = [model for model, _ in own], [t for _, t in own]
     for _ in range(MOST_STEPS if own else 0):
@@ -75,6 +73,15 @@ def corrected_raw(
         if moved < SETTLED_NT:
             break
     return raw
+
+
+def _on_time(record: Record, each: Sequence[Terms], theta: Sequence[Array], good: NDArray[np.bool_] | None) -> Array:
+    """Raw outputs (N, S, 3) nT at their time; NaN where that was recorded after the end."""
+    late = lateness(each, theta, record.raw[0].size)
+    if late is None:
+        return record.raw
+    flat = on_time(record.raw.reshape(len(record.raw), -1), record.time, record.run, late, good)
+    return np.where(unseen(record.time, record.run, late), np.nan, flat).reshape(record.raw.shape)
 
 
 def hidden_waveform(

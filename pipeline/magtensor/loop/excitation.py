@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from functools import cached_property
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +15,7 @@ from magtensor.attitude import into_platform_frame, to_world
 from magtensor.calibration.by_sensor import by_sensor
 from magtensor.calibration.types import Array
 from magtensor.errors import DataError, did_you_mean
+from magtensor.loop.delays import contiguous
 from magtensor.loop.held_logs import unheld
 from magtensor.loop.station import Station
 from magtensor.loop.terms import REFERENCE, Terms
@@ -309,9 +309,7 @@ class Excitation:
 
     def runs(self) -> list[tuple[int, int]]:
         """(first, one past last) sample of each contiguous run."""
-        edges = np.flatnonzero(np.diff(self.run)) + 1
-        bounds = [0, *edges.tolist(), len(self.run)]
-        return list(pairwise(bounds))
+        return contiguous(self.run)
 
     # The ways in which effects act.
 

@@ -38,7 +38,7 @@ from magtensor.simulate.effects.sensor import (
     NonlinearityQuadratic,
 )
 from magtensor.simulate.effects.site import FixedSource, PassingSource, SiteGradient
-from magtensor.simulate.effects.timing import ClockDrift, Jitter, SamplingLag
+from magtensor.simulate.effects.timing import ClockDrift, Jitter, LagStep, SamplingLag
 
 AnyEffect = Annotated[
     TemperatureOffset
@@ -67,6 +67,7 @@ AnyEffect = Annotated[
     | Hysteresis
     | Bandwidth
     | SamplingLag
+    | LagStep
     | ClockDrift
     | Jitter
     | PositionError

@@ -55,6 +55,26 @@ class SamplingLag(SensorEffectSpec):
         return _sampled_at(bench, -coefficients[None], self.name)
 
 
+class LagStep(SensorEffectSpec):
+    """Each sensor is sampled late from a time on: a sample of its stream was lost, or held twice."""
+
+    COEFFICIENTS = "lag_s"
+    DYNAMIC = True
+    LINEAR = False
+    type: Literal["lag_step"]
+    lag_s: PerSensor | None = Field(
+        None, description="delays of x, y, z behind the time stamp, s, for all sensors or for each"
+    )
+    time_s: float = Field(ge=0, description="from when on, s since the start")
+
+    def drawn(self, bench: Bench, rng: np.random.Generator) -> Array:
+        return np.repeat(1e-3 * rng.standard_normal((bench.sensors, 1)), 3, axis=1)
+
+    def waveform(self, bench: Bench, coefficients: Array) -> Array:
+        since = bench.time - bench.time[0] >= self.time_s
+        return _sampled_at(bench, np.where(since[:, None, None], -coefficients, 0.0), self.name)
+
+
 class ClockDrift(SensorEffectSpec):
     """The clock of a sensor's logger runs fast or slow: sample t was taken at t (1 + drift)."""
 
