@@ -3,7 +3,14 @@
 from magtensor_effects.ageing import offset_drift, offset_step, offset_while, scale_drift, scale_step, warm_up
 from magtensor_effects.channels import channel_response, moving_part, periodic_interference
 from magtensor_effects.geometry import baseline_expansion, finite_baseline, position_error
-from magtensor_effects.inertia import bandwidth, clock_drift, eddy_current, lag_step, sampling_lag, viscous_magnetisation
+from magtensor_effects.inertia import (
+    bandwidth,
+    clock_drift,
+    eddy_current,
+    lag_step,
+    sampling_lag,
+    viscous_magnetisation,
+)
 from magtensor_effects.latent import latent_source
 from magtensor_effects.mechanics import crosstalk, frame_flexure, turn_step
 from magtensor_effects.power import current_field, supply_offset, supply_scale

@@ -23,7 +23,7 @@ FieldAtStart = Annotated[
 @error_model(
     "instrument",
     needs=("rotation",),
-    source="the field at the earlier instant; timing shifts as in Alken (DMSP) and Styp-Rekowski et al. 2021 (GRACE-FO)",
+    source="the field at another instant; time shifts as in Alken (DMSP) and Styp-Rekowski et al. 2021 (GRACE-FO)",
     typical="25 nT for 1 ms at 0.5 rad/s in 50 000 nT",
 )
 def sampling_lag(
@@ -35,8 +35,9 @@ def sampling_lag(
 ) -> Terms:
     """Each sensor, or each axis, is sampled late by a constant time.
 
-    The coefficient is the delay; what it adds is, to first order, minus the rate of change of the output. A delay common to all sensors is a rotation
-    of the field and shows only against a reference. Rivals: `eddy_current`, which contains it; `bandwidth`.
+    The coefficient is the delay; what it adds is, to first order, minus the output's rate of change. A delay common to
+    all sensors is a rotation of the field and shows only against a reference. Rivals: `eddy_current`, which contains
+    it; `bandwidth`.
     """
     return x.late(np.ones(len(x.time)), "s", "lag", per_axis=per_axis)
 
@@ -90,7 +91,7 @@ def bandwidth(
 @error_model(
     "instrument",
     needs=("rotation",),
-    source="the field at the earlier instant",
+    source="the field at another instant",
     typical="one sampling interval: 2500 nT for 0.1 s at 0.5 rad/s",
 )
 def lag_step(x: Excitation, *, time_s: EventTime = 0.0, span_s: Span = 3600.0) -> Terms:
@@ -105,7 +106,7 @@ def lag_step(x: Excitation, *, time_s: EventTime = 0.0, span_s: Span = 3600.0) -
 @error_model(
     "instrument",
     needs=("rotation",),
-    source="the field at the earlier instant",
+    source="the field at another instant",
     typical="1 ppm over 1 h is 3.6 ms, 90 nT at 0.5 rad/s",
 )
 def clock_drift(x: Excitation) -> Terms:
