@@ -10,7 +10,7 @@ from magtensor.loop.assessment import Assessment
 from magtensor.loop.model import Adopted, State
 from magtensor.loop.residual import taken_off
 from magtensor.loop.settings import AnyChannel, profiled
-from magtensor.loop.terms import Terms
+from magtensor.loop.terms import Terms, joined
 
 ALPHA = 0.005  # family-wise probability that a clean survey gets an adoption, before the second gate
 ALONE = 1e-3  # probability that a single test by blocks is passed, which bears noise's own colour out
@@ -36,7 +36,7 @@ class Candidate:
         adjusted_null_p: the same for what it explains in noise of the residual's own colour.
         alpha: what the adjusted p has to stay below.
         log_noise: what noise in the log of its channel, brought in by a model adopted before, lets it gain.
-        beside: sum of squares that the models adopted before explain.
+        beside: sum of squares that the models adopted before explain to first order.
         before: what it was judged against, where that is the fit with it, its part put back (`own_fit`).
     """
 
@@ -132,9 +132,18 @@ def gained_of_a_log(log_noise: float, coefficients: float) -> float:
 
 
 def explained_before(state: State) -> float:
-    """Sum of squares of the whitened residual that the adopted models explain together."""
-    if state.terms is None:
-        return 0.0
+    """Sum of squares of the whitened residual that the adopted models explain together to first order.
+
+    Delays, which are taken off to all orders, have no part in it."""
     residual = state.residual
-    back = taken_off(residual, state.terms, -np.concatenate(state.theta))
+    first_order = [
+        (terms.at(residual.samples), theta)
+        for model, theta in zip(state.adopted, state.theta, strict=True)
+        if (terms := model.terms(state.excitation)).delay is None
+    ]
+    if not first_order:
+        return 0.0
+    back = taken_off(
+        residual, joined([terms for terms, _ in first_order]), -np.concatenate([t for _, t in first_order])
+    )
     return max(back.square() - residual.square(), 0.0) * len(residual.affine) * residual.freedom
