@@ -128,7 +128,8 @@ def _increasing(survey: Survey, time_faults: str, where: str, notes: list[str]) 
 
 
 def _reference_times(survey: Survey, time_faults: str, where: str, notes: list[str]) -> Survey:
-    """Reference samples without a value go; those whose time does not move on are refused or go."""
+    """Reference samples without a value go, and those that repeat a reading; those whose time does not move on are
+    refused or go."""
     if "reference/total_field" not in survey:
         return survey
     time = np.asarray(survey.values("reference/time"), dtype=np.float64)
@@ -148,10 +149,18 @@ def _reference_times(survey: Survey, time_faults: str, where: str, notes: list[s
             )
         notes.append(f"{int((~onward).sum())} reference samples left out; {what}")
     keep = np.flatnonzero(known)[onward]
-    if len(keep) == len(time):
-        return survey
+    held = checks.held_readings(time[keep], values[keep])
     if not known.all():
         notes.append(f"{int((~known).sum())} of {len(time)} reference samples have no value and are left out")
+    if held is not None:
+        readings, period = held
+        notes.append(
+            f"{int((~readings).sum())} of {len(keep)} reference samples repeat a reading, of which there is one every "
+            f"{period:.4g} s: they are left out, and the field in between is interpolated"
+        )
+        keep = keep[readings]
+    if len(keep) == len(time):
+        return survey
     return _select(survey, "reference", {"time": keep})
 
 

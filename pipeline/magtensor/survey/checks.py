@@ -23,6 +23,9 @@ IMPOSSIBLE = 1e3  # times a sensor's median magnitude: no range reaches so far b
 SINGLE_PRECISION, DOUBLE_PRECISION = 2e-7, 1e-12
 LEAST_FILLED_IN, MOST_FILLED_IN = 0.05, 0.96  # of the rows
 NEARLY_ALL = 0.8  # of the rows that are alike on all axes
+LEAST_CHANGES, LEAST_HELD_ROWS = 5, 2.5  # of a series that repeats its readings; rows from one to the next
+UNLIKELY_GRID = 1e-8  # that the changes of other series lie on a regular grid
+LEAST_SEVERAL = 0.2  # of the changes, by more than one of the smallest steps
 LOOKED_AT = 200_000  # samples; a step shows in these as in ten million
 # What a number that was labelled nT may have been, with the factor that makes nT of it.
 RIVALS = (
@@ -422,6 +425,42 @@ def _at_once(together: float, each: Floats) -> float:
         beyond = (together - h) * (1.0 - h) ** (len(each) - 1) > np.prod(each - h)
         low, high = (h, high) if beyond else (low, h)
     return low
+
+
+def held_readings(time: Floats, values: Floats) -> tuple[Bools, float] | None:
+    """Which rows of a series hold a reading of its instrument, where a table of more rows repeats each until the next,
+    and the time from one to the next, s; None where the rows are readings.
+
+    The value changes on a regular grid then, three rows apart or more, and often by several of its smallest steps.
+    Where coarse steps make a slow series repeat, it changes by one of them, at any time: each change lies on a grid by
+    chance with the probability of one in as many rows as that has from one reading to the next.
+
+    Args:
+        time: (N,) s, increasing; values: (N,) without missing ones.
+    """
+    changed = np.flatnonzero(np.diff(values) != 0) + 1
+    if len(changed) < LEAST_CHANGES:
+        return None
+    row, at = float(np.median(np.diff(time))), time[changed]
+    steps, between = np.abs(np.diff(values)[changed - 1]), np.diff(at)
+    several = np.mean(steps > 1.5 * steps.min())
+    if between.min() < LEAST_HELD_ROWS * row or several < LEAST_SEVERAL:
+        return None
+    usual = float(between[between < 1.6 * between.min()].mean())
+    number = np.concatenate([[0.0], np.cumsum(np.round(between / usual))])
+    period, first = (float(v) for v in np.polyfit(number, at, 1))
+    apart = at - first - period * number
+    by_chance = (row / period) ** (len(changed) - 2)  # two of them make the grid
+    if np.ptp(apart) > row or by_chance > UNLIKELY_GRID:
+        return None
+    begin = first + float(apart.min())  # of what a row shows at once
+    grid = np.arange(np.floor((time[0] - begin) / period), np.ceil((time[-1] - begin) / period) + 1)
+    own = np.searchsorted(time, begin + period * grid - 1e-6 * row)
+    readings = np.zeros(len(time), dtype=bool)
+    readings[own[own < len(time)]] = True
+    readings[changed] = True
+    readings[[0, -1]] = True  # held from before, and until after: nothing else is known there
+    return readings, period
 
 
 def new_share(field: Floats) -> float:
