@@ -72,6 +72,7 @@ RIGHT: dict[str, dict[str, Any]] = {
     "scale_step": {"time_s": 1000.0},
     "turn_step": {"time_s": 1000.0},
     "sampling_lag": {"per_axis": True},
+    "lag_step": {"time_s": 900.0},
     "viscous_magnetisation": {"tau_s": 20.0},
     "moving_part": {"channel": "encoder"},
     "periodic_interference": {"frequency_Hz": 49.7123},
