@@ -73,6 +73,7 @@ EFFECTS: dict[str, dict[str, Any]] = {
     "turn_step": {"time_s": 1000.0, "sensors": ["S2"]},
     "sampling_lag": {"per_axis": True},
     "lag_step": {"time_s": 900.0},
+    "averaging": {},
     "eddy_current": {},
     "bandwidth": {},
     "clock_drift": {},

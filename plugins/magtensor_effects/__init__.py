@@ -4,6 +4,7 @@ from magtensor_effects.ageing import offset_drift, offset_step, offset_while, sc
 from magtensor_effects.channels import channel_response, moving_part, periodic_interference
 from magtensor_effects.geometry import baseline_expansion, finite_baseline, position_error
 from magtensor_effects.inertia import (
+    averaging,
     bandwidth,
     clock_drift,
     eddy_current,
@@ -20,6 +21,7 @@ from magtensor_effects.temperature import temperature_offset, temperature_rate, 
 from magtensor_effects.transfer import cross_field, hysteresis, nonlinearity_cubic, nonlinearity_quadratic
 
 __all__ = [
+    "averaging",
     "bandwidth",
     "baseline_expansion",
     "channel_response",

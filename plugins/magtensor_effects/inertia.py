@@ -1,10 +1,12 @@
 """Error models of rates and delays: what comes late, or follows the change of the field."""
 
-from typing import Annotated
+from collections.abc import Mapping
+from typing import Annotated, Any
 
 import numpy as np
 from pydantic import Field
 
+from magtensor.calibration.types import Array
 from magtensor.components import error_model
 from magtensor.loop.excitation import Excitation
 from magtensor.loop.settings import Beginning, Choice, Range
@@ -101,6 +103,35 @@ def lag_step(x: Excitation, *, time_s: EventTime = 0.0, span_s: Span = 3600.0) -
     so the slip is none beyond span_s. Rivals: `sampling_lag` for a slip near the beginning, `clock_drift` for many.
     """
     return x.late(((x.elapsed >= time_s) & (x.elapsed <= span_s)).astype(float), "s", "lag")
+
+
+def _shortens(_: Mapping[str, Any], coefficients: Array, __: float) -> bool:
+    """A mean is shorter than what it is made of, in every sensor if each has a coefficient."""
+    return bool((coefficients > 0).all())
+
+
+@error_model(
+    "instrument",
+    needs=("rotation", "total_field"),
+    agrees=_shortens,
+    source="Taylor series of a running mean",
+    typical="a mean over 0.1 s at 0.7 rad/s is 10 nT too short in 50 000 nT; any recorder's low-pass does the same",
+)
+def averaging(
+    x: Excitation,
+    *,
+    per_sensor: Annotated[
+        bool, Choice((False, True)), Field(description="true: each sensor its own; false: one for all")
+    ] = False,
+) -> Terms:
+    """A row is the mean over some time, or was low-passed, and the mean of a vector that turns is too short.
+
+    The second rate of change of the output. The coefficient is half the variance of what a row is averaged with: of a
+    mean over T, T^2 / 24; of a pole of time constant tau, tau^2 / 2. What the mean is late by shows as a delay, if it
+    differs between sensors. Rivals: `bandwidth` of all axes alike; `sampling_lag` and `eddy_current` of a long time.
+    """
+    bent = x.sensed(x.curvature)
+    return x.one_each(bent, "s2", "spread") if per_sensor else x.shared(bent, "s2", "spread")
 
 
 @error_model(

@@ -24,7 +24,7 @@ CATALOGUE = {
         "cross_field", "hysteresis", "offset_step", "sampling_lag", "eddy_current", "bandwidth", "clock_drift",
         "crosstalk", "viscous_magnetisation", "moving_part", "periodic_interference", "frame_flexure",
         "channel_response", "finite_baseline", "position_error", "baseline_expansion", "latent_source",
-        "scale_step", "turn_step", "offset_while", "lag_step",
+        "scale_step", "turn_step", "offset_while", "lag_step", "averaging",
     },
     "site": {"fixed_source", "site_gradient", "passing_source"},
     "reference": {"reference_scale", "reference_clock", "reference_drift", "reference_step"},
@@ -73,6 +73,7 @@ NEEDED = {
     "bandwidth": ["rotation"],
     "clock_drift": ["rotation"],
     "lag_step": ["rotation"],
+    "averaging": ["rotation", "total_field"],
 }
 
 

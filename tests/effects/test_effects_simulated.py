@@ -201,6 +201,14 @@ def test_a_slip_by_a_sample_from_a_time_on() -> None:
     np.testing.assert_allclose(found, [row[0] for row in lag], atol=2e-3)  # to first order
 
 
+def test_rows_that_are_means() -> None:
+    # over 0.5 s and, in one sensor, 0.35 s, at rates of 0.44 rad/s: the fourth order is T^2 w^2 / 80
+    spread = [0.25 / 24.0, 0.25 / 24.0, 0.125 / 24.0, 0.25 / 24.0]
+    fit, survey, _ = fitted("averaging", {"per_sensor": True}, {"spread_s2": spread})
+    assert fit.left < 0.02
+    np.testing.assert_allclose([fit.coefficients["spread", s] for s in survey.sensors], spread, rtol=0.01)
+
+
 def test_clock_drift_in_ppm() -> None:
     fit, survey, _ = fitted("clock_drift", {}, {"ppm": [20.0, -5.0, 3.0, -9.0]})
     assert fit.left < 0.005  # second order: a delay of up to 4 ms

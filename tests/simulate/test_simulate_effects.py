@@ -39,6 +39,7 @@ EVERY: dict[str, dict[str, Any]] = {
     "turn_step": {"time_s": 20.0},
     "sampling_lag": {"per_axis": True},
     "lag_step": {"time_s": 20.0},
+    "averaging": {},
     "eddy_current": {},
     "bandwidth": {},
     "clock_drift": {},

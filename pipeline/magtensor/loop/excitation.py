@@ -307,6 +307,32 @@ class Excitation:
         out: Array = change + along * (self.derivative(length) - own)
         return out
 
+    @cached_property
+    def curvature(self) -> Array:
+        """d2B/dt2 (N, 3) nT/s2 where all sensors see one field, else (N, S, 3).
+
+        Across the field from differences over two samples to either side, in which noise is a quarter of that between
+        neighbours; along it what turning makes of a length that changes slowly, -|dB/dt|^2 / |B|. Zero in runs of fewer
+        than five samples; the two at each end have that of the third.
+        """
+        b = self.field_or_fields
+        length = np.linalg.norm(b, axis=-1, keepdims=True)
+        along = b / length
+        change = np.zeros_like(b)
+        for first, end in self.runs():
+            if end - first < 5:
+                continue
+            inner = change[first + 2 : end - 2]
+            t, v = self.time[first:end], b[first:end]
+            shape = (-1, *[1] * (b.ndim - 1))
+            before, after = (t[2:-2] - t[:-4]).reshape(shape), (t[4:] - t[2:-2]).reshape(shape)
+            inner[...] = 2.0 * ((v[4:] - v[2:-2]) / after - (v[2:-2] - v[:-4]) / before) / (before + after)
+            change[first : first + 2], change[end - 2 : end] = inner[0], inner[-1]
+        own = np.sum(along * change, axis=-1, keepdims=True)
+        turning = np.sum(self.rate**2, axis=-1, keepdims=True) / length
+        out: Array = change - along * (own + turning)
+        return out
+
     def runs(self) -> list[tuple[int, int]]:
         """(first, one past last) sample of each contiguous run."""
         return contiguous(self.run)

@@ -86,17 +86,37 @@ def own_information(g: Grams) -> Array:
 def own_information_of_each(g: Grams) -> Array:
     """(B, P) the same of each block or set."""
     out = np.zeros((len(g.zz), g.count))
-    raw = g.part_output >= 0
-    if raw.any() and g.zz.any():
-        dd = np.diagonal(g.dd, axis1=1, axis2=2)
+    raw = np.flatnonzero(g.part_output >= 0)
+    if len(raw) and g.zz.any():
         squares = np.maximum(np.diagonal(g.zz, axis1=1, axis2=2)[:, 3:], 1e-300)
-        constant = np.sum(g.zd[:, 3:] ** 2 / squares[:, :, None], axis=1)
-        size = np.maximum(dd - constant, 1e-12 * dd)
-        o = g.part_output[raw]
-        np.add.at(out.T, g.part_term[raw], (size[:, g.part_series[raw]] * g.projector[o, o] / g.noise[o] ** 2).T)
+
+        def of_pairs(i: NDArray[np.int_], j: NDArray[np.int_]) -> Array:
+            a, b, o, p = g.part_series[i], g.part_series[j], g.part_output[i], g.part_output[j]
+            constant = np.sum(g.zd[:, 3:, a] * g.zd[:, 3:, b] / squares[:, :, None], axis=1)
+            found: Array = (g.dd[:, a, b] - constant) * (g.projector[o, p] / (g.noise[o] * g.noise[p]))
+            return found
+
+        alone = of_pairs(raw, raw)
+        size = g.dd[:, g.part_series[raw], g.part_series[raw]] * g.projector[g.part_output[raw], g.part_output[raw]]
+        alone = np.maximum(alone, 1e-12 * size / g.noise[g.part_output[raw]] ** 2)
+        np.add.at(out.T, g.part_term[raw], alone.T)
+        i, j = _pairs_within(g.part_term[raw])
+        if len(i):  # what moves all sensors alike is in the plane that they share, whatever each output shows alone
+            together = out.copy()
+            np.add.at(together.T, g.part_term[raw[i]], of_pairs(raw[i], raw[j]).T)
+            out = np.maximum(together, IDENTIFIABLE * out)
     if g.aa.any():
         out += np.diagonal(g.aa, axis1=1, axis2=2)[:, g.own :]
     return out
+
+
+def _pairs_within(terms: NDArray[np.int_]) -> tuple[NDArray[np.int_], NDArray[np.int_]]:
+    """(R,), (R,) all ordered pairs of two different parts of one term."""
+    order = np.argsort(terms, kind="stable")
+    groups = np.split(order, np.flatnonzero(np.diff(terms[order])) + 1)
+    pairs = [(a, b) for group in groups if len(group) > 1 for a, b in itertools.permutations(group.tolist(), 2)]
+    found = np.array(pairs, dtype=np.int_).reshape(-1, 2)
+    return found[:, 0], found[:, 1]
 
 
 def explained_by_each(g: Grams) -> tuple[Array, NDArray[np.int_]]:

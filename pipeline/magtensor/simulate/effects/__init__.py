@@ -38,7 +38,7 @@ from magtensor.simulate.effects.sensor import (
     NonlinearityQuadratic,
 )
 from magtensor.simulate.effects.site import FixedSource, PassingSource, SiteGradient
-from magtensor.simulate.effects.timing import ClockDrift, Jitter, LagStep, SamplingLag
+from magtensor.simulate.effects.timing import Averaging, ClockDrift, Jitter, LagStep, SamplingLag
 
 AnyEffect = Annotated[
     TemperatureOffset
@@ -68,6 +68,7 @@ AnyEffect = Annotated[
     | Bandwidth
     | SamplingLag
     | LagStep
+    | Averaging
     | ClockDrift
     | Jitter
     | PositionError

@@ -98,6 +98,36 @@ class ClockDrift(SensorEffectSpec):
         return _sampled_at(bench, np.repeat(shift[..., None], 3, axis=-1), self.name)
 
 
+class Averaging(SensorEffectSpec):
+    """Each row is the mean over a time about its stamp."""
+
+    COEFFICIENTS = "spread_s2"
+    DYNAMIC = True
+    LINEAR = False
+    type: Literal["averaging"]
+    spread_s2: list[float] | None = Field(
+        None, description="half the variance of the time that each sensor's rows are the mean over: T^2 / 24"
+    )
+
+    def drawn(self, bench: Bench, rng: np.random.Generator) -> Array:
+        return np.full(bench.sensors, 1e-4 * (0.1 + abs(rng.standard_normal())))
+
+    def read(self, bench: Bench) -> Array:
+        values = np.array(self.given, dtype=float)
+        if values.shape != (bench.sensors,) or (values < 0).any():
+            raise UsageError(
+                f"effect averaging: spread_s2 is {self.given}; {bench.sensors} values from 0 on would be right"
+            )
+        return values
+
+    def waveform(self, bench: Bench, coefficients: Array) -> Array:
+        places, weights = np.polynomial.legendre.leggauss(6)
+        half = np.sqrt(24.0 * coefficients)[None, :, None] / 2.0 * np.ones((1, 1, 3))
+        parts = [0.5 * w * _sampled_at(bench, p * half, self.name) for p, w in zip(places, weights, strict=True)]
+        out: Array = np.sum(parts, axis=0)
+        return out
+
+
 class Jitter(SensorEffectSpec):
     """Each sensor's sampling instants scatter: noise that grows with the rate of change of the field."""
 
