@@ -9,7 +9,7 @@ from pydantic import Field
 from magtensor.calibration.types import Array
 from magtensor.components import error_model
 from magtensor.loop.excitation import Excitation
-from magtensor.loop.settings import Beginning, Choice, Range
+from magtensor.loop.settings import Beginning, Choice, Orders, Range
 from magtensor.loop.terms import Terms
 from magtensor_effects.ageing import EventTime, Span
 
@@ -121,7 +121,7 @@ def averaging(
     x: Excitation,
     *,
     per_sensor: Annotated[
-        bool, Choice((False, True)), Field(description="true: each sensor its own; false: one for all")
+        bool, Orders((False, True)), Field(description="true: each sensor its own; false: one for all")
     ] = False,
 ) -> Terms:
     """A row is the mean over some time, or was low-passed, and the mean of a vector that turns is too short.
