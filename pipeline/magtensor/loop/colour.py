@@ -95,17 +95,21 @@ def colour_of(series: Array, freedom: float | None = None, *, stiff: bool = Fals
     count = np.diff(edges) * k * share
     shapes_of = _laws if stiff else _relaxations
     shapes = shapes_of(centre, n)
-    # chi-square weights from the fitted level itself: two rounds settle them
-    model = level
+    # chi-square weights from the fitted level itself: two rounds settle them, or go in circles where a trend stands far
+    # above all else; the likeliest round counts
+    model, likeliest = level, np.inf
     for _ in range(4):
         weight = np.sqrt(count / 2.0) / np.maximum(model, 1e-300)
-        found, _ = nnls(shapes * weight[:, None], level * weight, maxiter=100 * shapes.shape[1])
-        model = shapes @ found
+        fitted, _ = nnls(shapes * weight[:, None], level * weight, maxiter=100 * shapes.shape[1])
+        model = shapes @ fitted
         if not model.min() > 0:
             model = np.maximum(model, 1e-12 * level.max())
+        unlikely = float(np.sum(count * (np.log(model) + level / model)))
+        if unlikely < likeliest:
+            found, best, likeliest = fitted, model, unlikely
     white = found[0]
     if white <= 0:
-        white = float(np.min(model))
+        white = float(np.min(best))
     every = np.concatenate([[frequency[0] / 2], frequency])
     total = white + shapes_of(every, n, found[1:] > 0)[:, 1:] @ found[1:][found[1:] > 0]
     relative = np.maximum(total / white, 1.0)
