@@ -9,7 +9,7 @@ from pydantic import Field
 from magtensor.calibration.types import Array
 from magtensor.components import error_model
 from magtensor.loop.excitation import Excitation
-from magtensor.loop.settings import Beginning, Choice, Orders, Range
+from magtensor.loop.settings import Beginning, Orders, Range
 from magtensor.loop.terms import Terms
 from magtensor_effects.ageing import EventTime, Span
 
@@ -32,7 +32,7 @@ def sampling_lag(
     x: Excitation,
     *,
     per_axis: Annotated[
-        bool, Choice((False, True)), Field(description="true: a delay for each axis; false: one for each sensor")
+        bool, Orders((False, True)), Field(description="true: a delay for each axis; false: one for each sensor")
     ] = False,
 ) -> Terms:
     """Each sensor, or each axis, is sampled late by a constant time.

@@ -104,7 +104,12 @@ def _rise(state: State, place: int) -> float:
 
 def _lasts(model: Adopted) -> bool:
     """Whether a model is neither of what happened once nor of a waveform found in the data."""
-    return model.name != NAME and not any(isinstance(g, EventTimes) for g in profiled(model.component).values())
+    return model.name != NAME and not happens_once(model)
+
+
+def happens_once(model: Adopted) -> bool:
+    """Whether a model is of an event, whose time is a setting."""
+    return any(isinstance(g, EventTimes) for g in profiled(model.component).values())
 
 
 def agrees(state: State, place: int) -> bool:

@@ -16,7 +16,7 @@ from magtensor.errors import DataError
 from magtensor.loop.adopting import adopt, narrowed, polished
 from magtensor.loop.beginnings import beginning
 from magtensor.loop.changing_matrix import channel_instead
-from magtensor.loop.contribution import agrees, eliminate, without_models
+from magtensor.loop.contribution import agrees, eliminate, happens_once, without_models
 from magtensor.loop.exchange import looked_at_again, simpler
 from magtensor.loop.excitation import Excitation
 from magtensor.loop.found import Search, Step
@@ -30,7 +30,7 @@ from magtensor.loop.own_fit import at_their_own_fit
 from magtensor.loop.profiling import already, repeatable
 from magtensor.loop.screening import candidates_of, generic
 from magtensor.loop.separation import SEPARATION, fold_gain, separated
-from magtensor.loop.settings import AnyChannel, EventTimes, profiled
+from magtensor.loop.settings import AnyChannel, profiled
 from magtensor.loop.several_logs import worse_log
 from magtensor.loop.spectrum import spectral_lines
 from magtensor.loop.trial import Trial, on_the_folds_of, per_sample, trial
@@ -254,7 +254,7 @@ def _kept(record: Record, before: Trial, chosen: Candidate, how: Fitting) -> tup
         return None, "fitted, its coefficients are not what its settings assume"
     if not before.likelier(after):
         return None, "fitted together with the others, it leaves more than it takes away"
-    if any(isinstance(grid, EventTimes) for grid in profiled(model.component).values()):
+    if happens_once(model):
         terms = chosen.terms.only(i for i, s in enumerate(chosen.terms.sensors) if s in acts_on)
         if channel := channel_instead(before.state, terms, chosen.assessment.colours):
             why = f"C of {', '.join(acts_on)} follows {channel}, which explains more than something that happens once"
@@ -314,8 +314,8 @@ def simplest(best: Candidate, possible: Sequence[Candidate], state: State) -> tu
     from the model that names its effect by less than that one's law may miss, and two logs of one cause by the noise of
     the worse one.
 
-    Simplest is more of what was adopted already, with another setting; then what has the fewest coefficients; a
-    response that lags by half the survey or longer comes after both.
+    Simplest is more of what was adopted already, with another setting; then what has the fewest coefficients, and of
+    those what lasts; a response that lags by half the survey or longer comes after both.
     A model that slow noise could explain is named, and not chosen before one that it could not.
     """
     colours = best.assessment.colours
@@ -333,9 +333,9 @@ def simplest(best: Candidate, possible: Sequence[Candidate], state: State) -> tu
             equal.append(other)
     known = {a.name for a in state.adopted}
 
-    def complexity(c: Candidate) -> tuple[bool, bool, bool, int, float]:
-        slow, new = _hardly_begun(c, state.excitation), c.model.name not in known
-        return generic(c.model), slow, new, c.assessment.estimate.rank, -c.assessment.gain.total
+    def complexity(c: Candidate) -> tuple[bool, bool, bool, int, bool, float]:
+        slow, new, once = _hardly_begun(c, state.excitation), c.model.name not in known, happens_once(c.model)
+        return generic(c.model), slow, new, c.assessment.estimate.rank, once, -c.assessment.gain.total
 
     chosen = min((c for c in equal if c is best or c.passes), key=complexity)
     return chosen, tuple(sorted({c.model.name for c in equal if c is not chosen} - {chosen.model.name}))
