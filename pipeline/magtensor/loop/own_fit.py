@@ -18,6 +18,8 @@ from magtensor.loop.contribution import put_back, slices
 from magtensor.loop.evidence import Whitened
 from magtensor.loop.gates import Candidate
 from magtensor.loop.model import Fitting, Record, State, joint_state
+from magtensor.loop.separation import fold_gain, lower_orders, separated
+from magtensor.loop.settings import profiled
 from magtensor.loop.terms import Terms
 from magtensor.sharing import shared_out
 
@@ -28,16 +30,42 @@ def at_their_own_fit(candidates: Sequence[Candidate], record: Record, state: Sta
     """The candidates, best first; those that are significant and not small judged anew.
 
     Each is fitted together with all that is adopted, on the samples that the fit without it believes. What it explains
-    is put back into the residual of that fit, to first order, and assessed there.
+    is put back into the residual of that fit, to first order, and assessed there; so are the orders below its own.
     """
     large = [c for c in candidates if c.significant and _large(c, state)]
+    each_with = [[c, *_below(c, state)] for c in large]
+    tried = [c for several in each_with for c in several]
+    judged = iter(shared_out(lambda c: _judged(c, record, state, how), tried))
     again = {}
-    for each, found in zip(large, shared_out(lambda c: _judged(c, record, state, how), large), strict=True):
-        if found is not None:
-            before, terms, assessment = found
-            before = replace(before, adopted=state.adopted)
-            again[id(each)] = replace(each, terms=terms, assessment=assessment, before=before)
+    for several in each_with:
+        own = [None if (found := next(judged)) is None else _there(c, found, state) for c in several]
+        if own[0] is not None:
+            again[id(several[0])] = _lowest(own[0], [c for c in own[1:] if c is not None], state)
     return sorted((again.get(id(c), c) for c in candidates), key=lambda c: -c.assessment.gain.total)
+
+
+def _below(candidate: Candidate, state: State) -> list[Candidate]:
+    """The same model with every lower order."""
+    model, residual, below = candidate.model, state.residual, []
+    for settings in lower_orders(model.settings, profiled(model.component)):
+        lower = replace(model, settings=settings)
+        terms = lower.terms(state.excitation).at(residual.samples)
+        assessment = assess(Whitened.of(residual, state.colours.across, state.colours.along, state.terms), terms)
+        below.append(replace(candidate, model=lower, terms=terms, assessment=assessment))
+    return below
+
+
+def _there(candidate: Candidate, found: tuple[State, Terms, Assessment], state: State) -> Candidate:
+    before, terms, assessment = found
+    return replace(candidate, terms=terms, assessment=assessment, before=replace(before, adopted=state.adopted))
+
+
+def _lowest(best: Candidate, below: Sequence[Candidate], state: State) -> Candidate:
+    """The lowest order that held-out blocks do not separate from the best, each judged at its own fit."""
+    colours = best.assessment.colours
+    reference = fold_gain(best.before or state, colours, best.terms)
+    kept = (c for c in below if not separated(reference, fold_gain(c.before or state, colours, c.terms)))
+    return min(kept, key=lambda c: c.assessment.estimate.rank, default=best)
 
 
 def _large(candidate: Candidate, state: State) -> bool:
