@@ -87,7 +87,7 @@ def bandwidth(
     is the time constant found. To first order that is a delay, so `sampling_lag` is its rival wherever tau_s is short
     against the motion.
     """
-    return x.responses(-x.relaxed(x.sensed(x.rate), tau_s), "s")
+    return x.responses(-x.sensed(x.relaxed(x.rate, tau_s)), "s")
 
 
 @error_model(

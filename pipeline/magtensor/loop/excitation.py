@@ -15,6 +15,7 @@ from magtensor.attitude import into_platform_frame, to_world
 from magtensor.calibration.by_sensor import by_sensor
 from magtensor.calibration.types import Array
 from magtensor.errors import DataError, did_you_mean
+from magtensor.loop import first_order
 from magtensor.loop.delays import contiguous
 from magtensor.loop.held_logs import unheld
 from magtensor.loop.station import Station
@@ -262,7 +263,7 @@ class Excitation:
         """
         if tau < 0:
             return self.later(series, tau)
-        return _first_order(self.time, np.asarray(series, dtype=float), tau) if tau > 0 else series
+        return first_order.straight(self.time, np.asarray(series, dtype=float), tau) if tau > 0 else series
 
     def later(self, series: Array, delay: float) -> Array:
         """A series (N, ...) later by a delay, s, or earlier where that is below 0; held beyond its ends."""
@@ -271,7 +272,7 @@ class Excitation:
         return np.column_stack(moved).reshape(np.shape(series))
 
     def relaxed(self, series: Array, tau: float) -> Array:
-        """A series (N, ...) seen through a first-order lag tau, s, exact for samples joined by straight lines.
+        """A series (N, ...) that turns with the platform, seen through a first-order lag tau, s.
 
         Each run starts in equilibrium with its first value.
         """
@@ -279,7 +280,8 @@ class Excitation:
             return series
         out = np.array(series, dtype=float)
         for a, b in self.runs():
-            out[a:b] = _first_order(self.time[a:b], out[a:b], tau)
+            response = first_order.smooth if b - a >= SPLINED else first_order.straight
+            out[a:b] = response(self.time[a:b], out[a:b], tau)
         return out
 
     def derivative(self, series: Array) -> Array:
@@ -415,38 +417,6 @@ class Excitation:
             outputs,
             index,
         )
-
-
-def _first_order(time: Array, series: Array, tau: float) -> Array:
-    """Exact response of tau y' + y = x to x linear between samples, y starting at x[0]."""
-    if len(time) < 2:
-        return series
-    step = np.diff(time)
-    decays: Array = np.exp(-step / tau)
-    ramps: Array = 1.0 - (1.0 - decays) * tau / step
-    shape = (-1, *[1] * (series.ndim - 1))
-    driven = ramps.reshape(shape) * series[1:] + (1.0 - decays - ramps).reshape(shape) * series[:-1]
-    return _recursion(np.concatenate([[1.0], decays]), np.concatenate([series[:1], driven]))
-
-
-def _recursion(decay: Array, drive: Array) -> Array:
-    """y[k] = decay[k] y[k - 1] + drive[k] from y = drive[0], in about 2 sqrt(N) steps: affine maps compose."""
-    n = len(decay)
-    length = max(1, int(np.sqrt(n)))
-    blocks = -(-n // length)
-    factor = np.ones(blocks * length)
-    value = np.zeros((blocks * length, *drive.shape[1:]))
-    factor[1:n], value[:n] = decay[1:], drive
-    factors, values = factor.reshape(blocks, length), value.reshape(blocks, length, -1)
-    for i in range(1, length):
-        values[:, i] += factors[:, i, None] * values[:, i - 1]
-        factors[:, i] *= factors[:, i - 1]
-    carry = np.zeros(values.shape[2])
-    for block in range(blocks):
-        values[block] += factors[block, :, None] * carry
-        carry = values[block, -1].copy()
-    out: Array = values.reshape(blocks * length, *drive.shape[1:])[:n]
-    return out
 
 
 def derivative_of(time: Array, series: Array) -> Array:
