@@ -47,7 +47,8 @@ every recipe.
 
 - The first argument is an `Excitation`: `time`, `elapsed`, `output`, `field`, `channel(name, lag_s)` and
   `thermometer(name, lag_s)`, `attitude`, `position`, and what is made of them: `derivative`, `relaxed` (a first-order
-  lag within each run), `lagged` (the same across gaps), `gradient`, `sensed` (what the sensors make of a vector).
+  lag of what turns with the platform, within each run), `lagged` (of what may jump, across gaps), `gradient`,
+  `sensed` (what the sensors make of a vector).
 - It returns `Terms`, most simply by `x.offsets` (a series on every axis), `x.scales` (a series times each axis's own
   output), `x.responses` (a series for each axis), `x.matrices` (a vector through nine coefficients a sensor),
   `x.one_each` (one coefficient a sensor), `x.shared` (one for all), `x.on_reference`; `joined` puts several together.
