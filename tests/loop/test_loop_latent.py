@@ -66,6 +66,17 @@ def test_a_factor_is_told_from_noise_and_its_direction_found() -> None:
     assert found.deviance < alone.deviance
 
 
+@pytest.mark.parametrize("strength", [1e2, 1e4])
+def test_a_factor_far_above_the_noise_leaves_no_second_one(strength: float) -> None:
+    rng = np.random.default_rng(5)
+    basis = plane(rng, 4)
+    wave = np.sign(rng.standard_normal(300))
+    z = (own_noise(rng, 300, 4) + strength * np.outer(wave, rng.standard_normal(12))) @ basis
+    covariance = z.T @ z / 300
+    found = with_factor(covariance, basis, by_sensor(4), noise_alone(covariance, basis, by_sensor(4)))
+    assert found.log_p(300) > np.log(0.001)
+
+
 def in_noise(signal: Array, strength: float, seed: int = 3) -> tuple[Array, Array, Array]:
     """Whitened outputs of four sensors with a source, the plane, and its vector; strength of the part off the plane."""
     rng = np.random.default_rng(seed)

@@ -64,14 +64,25 @@ def noise_alone(covariance: Array, basis: Array, groups: Groups) -> Factors:
 
 
 def with_factor(covariance: Array, basis: Array, groups: Groups, alone: Factors) -> Factors:
-    """Noise of the groups and one common factor; `alone` is the fit without it, from which it starts."""
+    """Noise of the groups and one common factor; `alone` is the fit without it.
+
+    The better of two maxima: from the noise as it is without a factor, and from a factor of all that the strongest
+    direction has above the others. A strong factor is in the noise without it, and the search does not come back.
+    """
     values, vectors = np.linalg.eigh(alone.covariance)
     values = np.maximum(values, 1e-9 * values[-1])
     root, inverse = vectors * np.sqrt(values) @ vectors.T, vectors / np.sqrt(values) @ vectors.T
     above, directions = np.linalg.eigh(inverse @ covariance @ inverse)
     first = basis @ (root @ directions[:, -1]) * np.sqrt(max(above[-1] - 1.0, 0.1))
     start = np.linalg.cholesky(alone.noise + 1e-9 * np.trace(alone.noise) * np.eye(len(basis)))
-    return _fitted(covariance, basis, groups, start, first)
+    variances, axes = np.linalg.eigh(covariance)
+    rest = float(np.mean(variances[:-1]))
+    strongest = basis @ axes[:, -1] * np.sqrt(variances[-1] - rest)
+    fits = (
+        _fitted(covariance, basis, groups, start, first),
+        _fitted(covariance, basis, groups, np.sqrt(rest) * np.eye(len(basis)), strongest),
+    )
+    return min(fits, key=lambda fit: fit.deviance)
 
 
 def _fitted(covariance: Array, basis: Array, groups: Groups, start: Array, direction: Array | None) -> Factors:
