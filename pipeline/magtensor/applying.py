@@ -95,6 +95,7 @@ def apply(
         "NOT taken off": "not_taken_off",
         "extrapolated": "extrapolated",
         "begins anew with this survey": "begins_anew",
+        "NOT taken off, for the lengths of this survey's vectors refute it": "not_on_this_survey",
     }
     told_of = (f"{what}: {attributes[name]}" for what, name in each.items() if name in attributes)
     notes = (*summary(found.flags), *told_of)
@@ -171,7 +172,15 @@ def apply_and_refine(
     from magtensor.calibration.surveys.corrections import with_scatter
     from magtensor.dated import at_date_of
     from magtensor.effect_errors import taken_off
-    from magtensor.loop.stored import begun_anew, cleaned, extrapolated, left_in, on_its_clock, stored_effects
+    from magtensor.loop.stored import (
+        begun_anew,
+        cleaned,
+        extrapolated,
+        left_in,
+        on_its_clock,
+        recorded_alike,
+        stored_effects,
+    )  # fmt: skip
     from magtensor.offsets_apart import scatter_for, without_scatter
     from magtensor.platform_frame import as_fitted, with_refined_rotation
     from magtensor.standing_out import flagged
@@ -190,6 +199,7 @@ def apply_and_refine(
         fitted = with_scatter(fitted, apart)
         adopted, theta, means = stored_effects(calibration, planned.registry)
         adopted = on_its_clock(adopted, theta, means, calibration, as_fitted(calibration, fitted), survey)
+        adopted, theta, refuted = recorded_alike(adopted, theta, means, as_fitted(calibration, fitted), survey)
         before, survey = survey, cleaned(survey, as_fitted(calibration, fitted), adopted, theta, means)
         if judge:
             known = calibration.values("calibration/noise_std") if "calibration/noise_std" in calibration else None
@@ -198,6 +208,7 @@ def apply_and_refine(
             "not_taken_off": left_in(survey, adopted),
             "extrapolated": extrapolated(before, calibration, adopted, means),
             "begins_anew": begun_anew(adopted, calibration),
+            "not_on_this_survey": refuted,
         }
         survey = survey.merged(_named(corrected(fitted, survey, **words), calibration, dated, apart))
         if refine_rotation:

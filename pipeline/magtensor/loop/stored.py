@@ -14,6 +14,7 @@ from magtensor.calibration.types import Array, ArrayCalibration
 from magtensor.errors import DataError, UsageError
 from magtensor.loop.another_survey import TONE, begins_anew, shows_a_state
 from magtensor.loop.correction import corrected_raw, corrected_reference
+from magtensor.loop.lengths import AVERAGING, averaged_otherwise
 from magtensor.loop.model import Adopted, Record
 from magtensor.loop.needs import FACTS
 from magtensor.loop.record import record_of
@@ -106,6 +107,24 @@ def begun_anew(adopted: Sequence[Adopted], calibration: Survey) -> str:
     if not adopted or "start" not in calibration["calibration/effects"].attrs:  # nothing says when that was
         return ""
     return ", ".join(dict.fromkeys(a.name for a in adopted if _of_a_time(a) and a.start is None))
+
+
+def recorded_alike(
+    adopted: Sequence[Adopted],
+    theta: Sequence[Array],
+    means: Mapping[str, Array],
+    fitted: ArrayCalibration,
+    survey: Survey,
+) -> tuple[list[Adopted], list[Array], str]:
+    """The effects that another survey has too, their coefficients, and the name of what its own lengths refute: rows
+    that are averages belong to the way a survey was recorded. "" where nothing is refuted."""
+    others = [i for i, a in enumerate(adopted) if a.name != AVERAGING]
+    record = record_of(survey, means=means, every=True) if len(others) < len(adopted) else None
+    if record is None or any(a.component.effect != "site" and _lacking(a, record) for a in adopted):
+        return list(adopted), list(theta), ""  # what it lacks is told when the effects are taken off
+    if not averaged_otherwise(record, fitted, adopted, theta, survey.good):
+        return list(adopted), list(theta), ""
+    return [adopted[i] for i in others], [theta[i] for i in others], AVERAGING
 
 
 def begun_with(adopted: Sequence[Adopted], begun: datetime, survey: Survey) -> list[Adopted]:
