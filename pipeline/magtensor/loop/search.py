@@ -223,7 +223,8 @@ def _first_kept(
         if dropped:
             after = trial(record, last, how)
         if chosen.model.name in dropped and len(last.adopted) <= len(before.state.adopted):
-            return _Kept(None, chosen, rivals, dropped, refused)
+            refused[chosen.model.name] = "fitted, it does not earn its place on held-out blocks"
+            continue
         return _Kept(after, chosen, rivals, dropped, refused)
     return _Kept(None, refused=refused)
 
@@ -338,7 +339,28 @@ def simplest(best: Candidate, possible: Sequence[Candidate], state: State) -> tu
         return generic(c.model), slow, new, c.assessment.estimate.rank, once, -c.assessment.gain.total
 
     chosen = min((c for c in equal if c is best or c.passes), key=complexity)
+    chosen = lasting_instead(chosen, possible)
     return chosen, tuple(sorted({c.model.name for c in equal if c is not chosen} - {chosen.model.name}))
+
+
+def lasting_instead(chosen: Candidate, possible: Sequence[Candidate]) -> Candidate:
+    """What lasts in the place of something that happens once, if it predicts more with no more coefficients.
+
+    A slip soon after the start is a delay for all but the first samples: the few blocks that it misses scatter what it
+    is behind by, so that it seems no worse than the best, from which the delay itself is told apart.
+    """
+    if not happens_once(chosen.model):
+        return chosen
+    better = [
+        c
+        for c in possible
+        if c.passes
+        and not happens_once(c.model)
+        and not generic(c.model)
+        and c.assessment.estimate.rank <= chosen.assessment.estimate.rank
+        and c.assessment.gain.total > chosen.assessment.gain.total
+    ]
+    return max(better, key=lambda c: c.assessment.gain.total, default=chosen)
 
 
 def _hardly_begun(candidate: Candidate, x: Excitation) -> bool:
