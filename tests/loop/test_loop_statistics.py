@@ -160,6 +160,32 @@ def test_slow_noise_on_a_platform_that_turns_is_no_line() -> None:
     assert min(smallest) > 0.01
 
 
+def with_gaps(record: Record) -> Record:
+    """A stretch, every 97th sample and some single ones are missing."""
+    n = len(record.time)
+    lost = np.random.default_rng(n).uniform(size=n) < 0.01
+    lost[::97] = True
+    lost[n // 3 : n // 3 + n // 20] = True
+    return record.at(np.flatnonzero(~lost))
+
+
+def test_missing_samples_hide_no_line() -> None:
+    record = with_gaps(with_line(1, 0.3)[1])
+    frequency, rms, p = spectral_lines(linear_state(record).residual, record.time)[0]
+    assert frequency == pytest.approx(0.083, abs=1 / 2400)
+    assert p < 1e-6
+    assert 0.1 < rms < 0.35
+
+
+def test_missing_samples_make_no_line_of_slow_noise() -> None:
+    smallest = []
+    for seed in range(10):
+        walks = np.cumsum(np.random.default_rng(seed).standard_normal((1600, 4, 3)), axis=0)
+        record = with_gaps(synthetic(40 + seed, 1600, added=walks, turning_s=3.0))
+        smallest.append(spectral_lines(linear_state(record).residual, record.time)[0][2])
+    assert min(smallest) > 0.01
+
+
 def _of(seed: int) -> tuple:
     state, record = with_line(seed, 0.0)
     return state.residual, record.time

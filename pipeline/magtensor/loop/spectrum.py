@@ -8,13 +8,16 @@ from magtensor.calibration.types import Array
 from magtensor.loop.colour import beside_the_field
 from magtensor.loop.residual import Residual
 
+MOST_MISSING = 0.25  # of the samples of an even grid
+
 
 def spectral_lines(residual: Residual, time: Array, most: int = 5) -> list[tuple[float, float, float]]:
     """(frequency Hz, rms nT, p) of the strongest peaks of the residual across over its smooth spectrum.
 
     p is that of the largest of all peaks under noise without lines. What C took of slow noise turns with the platform,
     at a rate that would seem a line, and is put back (`colour.beside_the_field`). The lowest frequencies, where no
-    smooth spectrum can be told from a line, are left out; so are surveys that are not evenly sampled.
+    smooth spectrum can be told from a line, are left out; so are surveys that are not evenly sampled. Samples that are
+    missing from an even grid, no more than a quarter, are interpolated.
     """
     from scipy.fft import rfft
     from scipy.special import chdtrc, chdtri
@@ -22,10 +25,15 @@ def spectral_lines(residual: Residual, time: Array, most: int = 5) -> list[tuple
     if len(time) < 256 or residual.across is None:
         return []
     step = np.median(np.diff(time))
-    if np.max(np.abs(np.diff(time) - step)) > 0.5 * step:
+    steps = np.rint(np.diff(time) / step)
+    places = np.concatenate([[0.0], np.cumsum(steps)])
+    if steps.min() < 1.0 or len(time) < (1.0 - MOST_MISSING) * (places[-1] + 1.0):
         return []
     values, vectors = np.linalg.eigh(residual.projector)
     coordinates, _ = beside_the_field(residual.across @ vectors[:, values > 0.5], residual.affine)
+    grid = np.arange(places[-1] + 1.0)
+    if len(grid) > len(time):
+        coordinates = np.column_stack([np.interp(grid, places, column) for column in coordinates.T])
     n, k = coordinates.shape
     # without the highest frequency of an even number of samples, which has one phase and not two
     power = np.sum(np.abs(rfft(coordinates, axis=0)) ** 2, axis=1)[1 : (n + 1) // 2] / n
