@@ -6,7 +6,7 @@ from pydantic import Field
 
 from magtensor.components import error_model
 from magtensor.loop.excitation import Excitation
-from magtensor.loop.settings import AnyChannel, Orders, Range
+from magtensor.loop.settings import AnyChannel, Beginning, Orders, Range
 from magtensor.loop.terms import Terms, joined
 from magtensor_effects.forms import AtStart, Delayed, OfField
 
@@ -95,15 +95,21 @@ def temperature_rate(
         Range(5.0, 600.0, count=6, spacing="log"),
         Field(gt=0, description="time constant of the core behind the skin, s"),
     ] = 20.0,
+    at_start: Annotated[
+        float,
+        Beginning("tau_s"),
+        Field(description="by how much the core was warmer than the logged temperature when the survey began"),
+    ] = 0.0,
 ) -> Terms:
     """Thermoelectric currents follow the temperature difference between the skin of a body and its core.
 
     The core follows the logged temperature with a first-order lag; for changes slower than that the difference is
     tau_s times the rate of change, without the noise that a numerical derivative would bring. One coefficient an
-    axis. Rival: `temperature_offset` with a lag.
+    axis. What was brought from elsewhere began with a difference. Rivals: `temperature_offset` with a lag; `warm_up`
+    where such a beginning is all there is.
     """
     name = THERMOMETER.pick(x, channel)
-    return x.offsets(x.thermometer(name) - x.thermometer(name, tau_s), f"nT/{x.units[name]}")
+    return x.offsets(x.thermometer(name) - x.thermometer(name, tau_s, at_start=at_start), f"nT/{x.units[name]}")
 
 
 def _powers(units: str, order: int) -> list[tuple[int, str, str]]:

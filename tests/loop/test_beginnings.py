@@ -21,8 +21,9 @@ COUPLING = 1e-5 * np.array(
 )
 
 
-def warmed(folder: Path, seed: int, first_degC: float) -> Path:
-    """A survey whose offsets follow a body behind the thermometer, at the start so much warmer than that."""
+def warmed(folder: Path, seed: int, first_degC: float, *, difference: bool = False) -> Path:
+    """A survey whose offsets follow a body behind the thermometer, at the start so much warmer than that; or what the
+    thermometer shows less that body."""
     path = survey_file(folder, scenario(seed), f"{seed}.h5")
     with h5py.File(path, "a") as file:
         time, air = file["time"][:], file["temperature"][:]
@@ -30,7 +31,7 @@ def warmed(folder: Path, seed: int, first_degC: float) -> Path:
         body[0] = air[0] + first_degC
         for i in range(1, len(air)):  # Euler's steps, a hundredth of the lag or shorter
             body[i] = body[i - 1] + (time[i] - time[i - 1]) / TAU_S * (air[i - 1] - body[i - 1])
-        file["b_raw"][:] = file["b_raw"][:] + body[:, None, None] * PER_DEGREE
+        file["b_raw"][:] = file["b_raw"][:] + (air - body if difference else body)[:, None, None] * PER_DEGREE
     return path
 
 
@@ -70,6 +71,18 @@ def test_what_the_sensors_had_from_before_is_no_second_effect(first: float, seco
     assert settings["lag_s"] == pytest.approx(TAU_S, rel=0.1)
     # what dies away shows well, what a degree does less so, and their ratio as that does
     assert settings["at_start"] == pytest.approx(first, rel=0.2, abs=0.6)
+    before, after = (told["error"]["verify"][k]["tensor_rms_nT_per_m"]["all"] for k in ("before", "after"))
+    here = told["error"]["held_out"]["after"]["tensor_rms_nT_per_m"]["all"]
+    assert after < 1.1 * here and after < 0.7 * before
+
+
+def test_a_core_that_was_warmer_than_its_skin_at_the_start(tmp_path: Path) -> None:
+    survey, other = (warmed(tmp_path, s, first, difference=True) for s, first in ((61, 5.0), (62, -4.0)))
+    told = close_loop(survey, verify=other, search=lasting_effects()).verdict
+    assert [a["error_model"] for a in told["adopted"]] == ["temperature_rate"], told["unexplained"]["description"]
+    settings = told["adopted"][0]["settings"]
+    assert settings["tau_s"] == pytest.approx(TAU_S, rel=0.1)
+    assert settings["at_start"] == pytest.approx(5.0, rel=0.2)
     before, after = (told["error"]["verify"][k]["tensor_rms_nT_per_m"]["all"] for k in ("before", "after"))
     here = told["error"]["held_out"]["after"]["tensor_rms_nT_per_m"]["all"]
     assert after < 1.1 * here and after < 0.7 * before
