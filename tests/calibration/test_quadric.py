@@ -70,6 +70,34 @@ def test_field_that_varies_by_a_factor() -> None:
     np.testing.assert_allclose(found.shape, np.linalg.inv(c @ c.T), atol=1e-8)
 
 
+@pytest.mark.parametrize("rounding", [1e-9, 1e-8])
+def test_rounding_that_moves_the_centre_does_not_keep_it_from_settling(rounding: float) -> None:
+    """On ill-conditioned samples the fit's own rounding moves the centre by more than the step that counts as none."""
+    rng = np.random.default_rng(7)
+    field = rng.uniform(45_000, 55_000, 80)
+    raw = field[:, None] * directions(rng, 80) + [900.0, -400, 250]
+    noise = np.random.default_rng(8)
+
+    def rounded(x: np.ndarray) -> np.ndarray:
+        return ellipsoid_restricted(x) * (1 + rounding * noise.normal(size=10))
+
+    found = fit_ellipsoid(raw, field, rounded)
+    np.testing.assert_allclose(found.offset, [900.0, -400, 250], atol=50 * rounding * 50_000)
+
+
+def test_a_centre_that_never_rests_is_told() -> None:
+    rng = np.random.default_rng(9)
+    field = rng.uniform(45_000, 55_000, 80)
+    raw = field[:, None] * directions(rng, 80)
+    noise = np.random.default_rng(10)
+
+    def restless(x: np.ndarray) -> np.ndarray:
+        return ellipsoid_restricted(x + 0.01 * noise.normal(size=3))
+
+    with pytest.raises(NotAnEllipsoid, match="does not settle"):
+        fit_ellipsoid(raw, field, restless)
+
+
 def test_taubin_distance_is_that_of_the_noise() -> None:
     rng = np.random.default_rng(5)
     points = directions(rng, 5000) * [1.0, 0.8, 0.6] + 1e-3 * rng.normal(size=(5000, 3))

@@ -18,6 +18,11 @@ from .types import Array
 
 Fit = Callable[[Array], Array]
 
+SETTLED = 1e-10  # of the field: a step of the fixed point of `fit_ellipsoid` that is none
+ROUNDED = (
+    1e-6  # of the field: steps that shrink no more are the rounding of the fit below this, and no fixed point above
+)
+
 
 class NotAnEllipsoid(NotEnoughData):
     """The quadric that fits the samples best is open (a hyperboloid, a paraboloid, a cylinder or planes)."""
@@ -197,7 +202,8 @@ def fit_ellipsoid(raw: Array, total_field: Array, fit: Fit) -> Ellipsoid:
 
     Each sample is moved along its radius from the centre to where it would lie in the mean field, and the fit
     repeated until the centre rests: the fixed point minimises the algebraic distance of the F-normalised model.
-    With a constant field the first fit is final.
+    It rests where a step is below `SETTLED`, or, once all steps are below `ROUNDED`, where they shrink no more: what
+    is left then is the rounding of the fit itself. With a constant field the first fit is final.
 
     Parameters
     ----------
@@ -213,12 +219,14 @@ def fit_ellipsoid(raw: Array, total_field: Array, fit: Fit) -> Ellipsoid:
     stretch = (field / total_field)[:, None]
     constant = bool(np.all(total_field == total_field[0]))
     centre = np.zeros(3)
+    before = np.inf
     for _ in range(100):
         found = ellipsoid_of(fit((centre + (raw - centre) * stretch) / field))
-        step = found.offset * field - centre
+        step = float(np.linalg.norm(found.offset - centre / field))
         centre = found.offset * field
-        if constant or np.linalg.norm(step) < 1e-10 * field:
+        if constant or step < SETTLED or before <= step < ROUNDED:
             return Ellipsoid(found.shape, centre)
+        before = step
     raise NotAnEllipsoid(
         "the ellipsoid's centre does not settle under this variation of the total field",
         hint="check that the reference total field belongs to these samples",
