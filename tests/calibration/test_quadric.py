@@ -70,19 +70,20 @@ def test_field_that_varies_by_a_factor() -> None:
     np.testing.assert_allclose(found.shape, np.linalg.inv(c @ c.T), atol=1e-8)
 
 
-@pytest.mark.parametrize("rounding", [1e-9, 1e-8])
+@pytest.mark.parametrize("rounding", [1e-8, 1e-7])
 def test_rounding_that_moves_the_centre_does_not_keep_it_from_settling(rounding: float) -> None:
     """On ill-conditioned samples the fit's own rounding moves the centre by more than the step that counts as none."""
     rng = np.random.default_rng(7)
     field = rng.uniform(45_000, 55_000, 80)
-    raw = field[:, None] * directions(rng, 80) + [900.0, -400, 250]
+    offset = np.array([20_000.0, -15_000, 10_000])
+    raw = field[:, None] * directions(rng, 80) + offset
     noise = np.random.default_rng(8)
 
     def rounded(x: np.ndarray) -> np.ndarray:
         return ellipsoid_restricted(x) * (1 + rounding * noise.normal(size=10))
 
     found = fit_ellipsoid(raw, field, rounded)
-    np.testing.assert_allclose(found.offset, [900.0, -400, 250], atol=50 * rounding * 50_000)
+    np.testing.assert_allclose(found.offset, offset, atol=50 * rounding * 50_000)
 
 
 def test_a_centre_that_never_rests_is_told() -> None:

@@ -19,9 +19,7 @@ from .types import Array
 Fit = Callable[[Array], Array]
 
 SETTLED = 1e-10  # of the field: a step of the fixed point of `fit_ellipsoid` that is none
-ROUNDED = (
-    1e-6  # of the field: steps that shrink no more are the rounding of the fit below this, and no fixed point above
-)
+ROUNDED = 1e-6  # of the field: below this, steps that shrink no more are the rounding of the fit
 
 
 class NotAnEllipsoid(NotEnoughData):
