@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from magtensor.calibration.types import Array
-from magtensor.loop.colour import Colour, colour_of
+from magtensor.loop.colour import Colour, colour_of, smooth_colour
 from magtensor.loop.evidence import Grams, Whitened, grams, grams_in, normal
 from magtensor.loop.residual import Residual, taken_off
 from magtensor.loop.statistics import Estimate, Gain, family_p, focused_gain, held_out_gain, own_information, solve
@@ -72,6 +72,8 @@ class Assessment:
             where it is all in one sensor with more slow noise than the others.
         colours: under the hypothesis that the terms are real.
         theta: the likeliest coefficients, with any colour: where a joint fit begins.
+        smooth_p: of what happens once, the same as `null_p` in noise with the smoothed spectrum of that residual,
+            whatever its law; 0 of what lasts.
     """
 
     estimate: Estimate
@@ -83,6 +85,7 @@ class Assessment:
     null_p: float
     colours: Colours
     theta: Array
+    smooth_p: float = 0.0
 
 
 def block_count(samples: int) -> int:
@@ -90,17 +93,22 @@ def block_count(samples: int) -> int:
     return int(np.clip(samples // LEAST_PER_BLOCK, 1, FINEST_BLOCKS))
 
 
-def assess(now: Whitened, terms: Terms) -> Assessment:
+def assess(now: Whitened, terms: Terms, *, once: bool = False) -> Assessment:
     """Assess terms that no model holds yet, the coefficients of those that are in already being free as well.
 
     Two colours of noise are needed. A test of the null hypothesis uses the colour of the residual as it is: slow noise
     that a flexible model could follow must count as noise. How much the terms explain, and how well they compare with
     others, is asked in the colour of what they leave: seen in the first colour, a strong slow effect is itself noise.
 
+    What happens once, with a time sought in the data, wants a third. Any wandering has a place that looks like a step
+    or a bump, by far too large for the laws that the other two follow. But a step is coherent over all frequencies at
+    which it stands above the white noise, and the wandering is not.
+
     Parameters
     ----------
     now: the residual of the current model with its terms, in noise of the residual's own colour.
     terms: with the residual's samples as rows.
+    once: whether they are of something that happens once.
     """
     residual, given = now.residual, now.given
     together = terms if given is None else joined([given, terms])
@@ -113,13 +121,17 @@ def assess(now: Whitened, terms: Terms) -> Assessment:
     null_focused = focused_gain(null, residual.freedom, blocked)
     best = likeliest(residual, together, [Colours(now.across, now.along), WHITE], _estimate(null).theta)
     colours = best.colours
-    stronger = slow_noise_of(_only_sensor(null, first, terms), taken_off(residual, together, best.theta), now.across)
+    sensor = _only_sensor(null, first, terms)
+    stronger = slow_noise_of(sensor, taken_off(residual, together, best.theta), now.across)
     null_p = _p_of(null, first, max(stronger, 1.0))
     blocks = grams(residual, together, colours.across, colours.along, count)
     p = family_p(blocks, together.sensors, own)
     gain = held_out_gain(blocks, residual.freedom, blocked)
     focused = focused_gain(blocks, residual.freedom, blocked)
-    return Assessment(_estimate(blocks), gain, null_gain, focused, null_focused, p, null_p, colours, best.theta)
+    smooth_p = _smooth_p(residual, given, terms, sensor) if once else 0.0
+    return Assessment(
+        _estimate(blocks), gain, null_gain, focused, null_focused, p, null_p, colours, best.theta, smooth_p
+    )
 
 
 @dataclass(frozen=True)
@@ -165,6 +177,20 @@ def _p_of(blocks: Grams, given: int, variance: float) -> float:
     every, without = solve(n[0], y[0], scale), solve(n[0, :given, :given], y[0, :given], scale[:given])
     gained = max(explained(every) - explained(without), 0.0) / variance
     return float(chdtrc(max(every.rank - without.rank, 1), gained))
+
+
+def _smooth_p(residual: Residual, given: Terms | None, terms: Terms, sensor: int | None) -> float:
+    """P value of terms in noise with the residual's own spectrum, smoothed; across, that of one sensor if given."""
+    white = Colour(None, 1.0)
+    across = along = white
+    if residual.across is not None:
+        own = slice(None) if sensor is None else slice(3 * sensor, 3 * sensor + 3)
+        columns = residual.across[:, own]
+        across = smooth_colour(columns, columns.shape[1] * (1.0 - 3.0 / len(residual.noise)))
+    if residual.along is not None:
+        along = smooth_colour(residual.along)
+    blocks = grams_in(Whitened.of(residual, across, along, given), terms)
+    return _p_of(blocks, 0 if given is None else given.count, 1.0)
 
 
 def _only_sensor(blocks: Grams, given: int, terms: Terms) -> int | None:

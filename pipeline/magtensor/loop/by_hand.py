@@ -126,9 +126,8 @@ def candidate(component: Component, given: Mapping[str, Any], state: State, mode
             raise UsageError(ADOPTED.format(component.name))
         reason = failed.get(component.name, "it has no regressor here that the calibration does not have already")
         raise DataError(f"{component.name} cannot be fitted to this survey: {reason}")
-    p, null_p = (min(1.0, each * max(models, 1)) for each in (found[0].adjusted_p, found[0].adjusted_null_p))
     model = replace(found[0].model, settings={**given, **found[0].model.settings})
-    return replace(found[0], model=model, adjusted_p=p, adjusted_null_p=null_p)
+    return replace(found[0].among(models), model=model)
 
 
 def pinned(component: Component, settings: Mapping[str, Any]) -> Component:

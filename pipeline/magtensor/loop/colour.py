@@ -19,7 +19,10 @@ from magtensor.calibration.types import Array
 
 _COLUMNS = 16  # filtered at a time
 _SHORT = np.array([1.0, 3.0, 10.0])  # time constants in samples
+_LEAST = 64  # samples, of fewer the noise is taken for white
 _LEAST_OF_SHORT = 100  # of them in a survey, or it is not short
+_OCTAVE = 4  # frequencies in the lowest one
+_SMOOTHING = 8  # rounds in which a course between the middles of octaves gets their levels
 _SETTLING = 3  # rounds in which a colour and what goes with the field settle
 
 
@@ -75,19 +78,14 @@ def colour_of(series: Array, freedom: float | None = None, *, stiff: bool = Fals
     stiff: white, 1/f, 1/f^2 and processes of a few samples only, so that the lowest frequencies follow from the
         middle ones. What a regressor took away there, having followed the noise, is then not missed.
     """
-    from scipy.fft import dct
     from scipy.optimize import nnls
 
     columns = series.reshape(len(series), -1)
     n, k = columns.shape
     share = (freedom or k) / k
-    if n < 64:
-        return Colour(None, max(float(np.mean(columns**2)) / share, 1e-300))
-    power = np.zeros(n)
-    for start in range(0, k, _COLUMNS):
-        power += np.sum(dct(columns[:, start : start + _COLUMNS], axis=0, norm="ortho") ** 2, axis=1)
-    power /= k * share
-    power = power[1:]
+    if n < _LEAST:
+        return _white(columns, share)
+    power = _spectrum(columns, share)
     frequency = np.arange(1, n) / (2.0 * n)  # cycles per sample
     edges = np.unique(np.round(np.geomspace(1, n, min(60, n // 4))).astype(int))
     level = np.add.reduceat(power, edges[:-1] - 1) / np.diff(edges)
@@ -116,6 +114,47 @@ def colour_of(series: Array, freedom: float | None = None, *, stiff: bool = Fals
     if relative[1] < 1.05:
         return Colour(None, white)
     return Colour(relative, white)
+
+
+def smooth_colour(series: Array, freedom: float | None = None) -> Colour:
+    """The mean spectrum of the columns of (N, K) itself, smoothed over octaves: noise of whatever law.
+
+    Parameters
+    ----------
+    series, freedom: as in `colour_of`.
+    """
+    columns = series.reshape(len(series), -1)
+    n, k = columns.shape
+    share = (freedom or k) / k
+    if n < _LEAST:
+        return _white(columns, share)
+    power = np.maximum(_spectrum(columns, share), 1e-300)
+    edges = np.minimum(_OCTAVE * 2 ** np.arange(int(np.log2(n)) + 1), n)
+    edges = np.concatenate([[1], edges[edges < n // 2], [n]])
+    place = np.log(np.arange(1, n))
+    level, middle = (np.add.reduceat(values, edges[:-1] - 1) / np.diff(edges) for values in (power, place))
+    course = np.log(level)
+    for _ in range(_SMOOTHING):
+        smooth = np.exp(np.interp(place, middle, course))
+        course += np.log(level / (np.add.reduceat(smooth, edges[:-1] - 1) / np.diff(edges)))
+    smooth = np.exp(np.interp(place, middle, course))
+    white = float(smooth.min())
+    return Colour(np.concatenate([smooth[:1], smooth]) / white, white)
+
+
+def _white(columns: Array, share: float) -> Colour:
+    return Colour(None, max(float(np.mean(columns**2)) / share, 1e-300))
+
+
+def _spectrum(columns: Array, share: float) -> Array:
+    """(N - 1,) mean power of the columns of (N, K) at the cosine frequencies above zero."""
+    from scipy.fft import dct
+
+    n, k = columns.shape
+    power = np.zeros(n)
+    for start in range(0, k, _COLUMNS):
+        power += np.sum(dct(columns[:, start : start + _COLUMNS], axis=0, norm="ortho") ** 2, axis=1)
+    return power[1:] / (k * share)
 
 
 def beside_the_field(series: Array, affine: Array) -> tuple[Array, Colour]:

@@ -55,6 +55,5 @@ def looked_at_again(state: State, other: Candidate, models: int) -> Candidate | 
     found = candidates_of(state, [other.model.component], {}, other.alpha)
     if not found:
         return None
-    p, null_p = (min(1.0, each * max(models, 1)) for each in (found[0].adjusted_p, found[0].adjusted_null_p))
-    again = replace(found[0], adjusted_p=p, adjusted_null_p=null_p)
+    again = found[0].among(models)
     return again if again.passes else None

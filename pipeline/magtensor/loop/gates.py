@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -34,6 +34,8 @@ class Candidate:
         assessment: of the terms, given the models adopted before.
         adjusted_p: after the correction for settings and for the number of models.
         adjusted_null_p: the same for what it explains in noise of the residual's own colour.
+        adjusted_smooth_p: the same for what it explains in noise with the residual's own spectrum, smoothed; 0 of what
+            lasts.
         alpha: what the adjusted p has to stay below.
         log_noise: what noise in the log of its channel, brought in by a model adopted before, lets it gain.
         beside: sum of squares that the models adopted before explain to first order.
@@ -50,6 +52,14 @@ class Candidate:
     log_noise: float = 0.0
     beside: float = 0.0
     before: State | None = None
+    adjusted_smooth_p: float = 0.0
+
+    def among(self, models: int) -> Candidate:
+        """The same, found among so many models rather than by itself."""
+        p, null_p, smooth_p = (
+            min(1.0, each * max(models, 1)) for each in (self.adjusted_p, self.adjusted_null_p, self.adjusted_smooth_p)
+        )
+        return replace(self, adjusted_p=p, adjusted_null_p=null_p, adjusted_smooth_p=smooth_p)
 
     @property
     def of_the_log(self) -> bool:
@@ -84,9 +94,11 @@ class Candidate:
         explain what the model does: it predicts held-out blocks even so, or that much would be too unlikely.
 
         What happens once, at the beginning or end, is seen by few blocks, and the others cannot predict it closely
-        enough in noise so strong.
+        enough in noise so strong. Of its time, sought in all blocks, nothing was held out: it has to be sharper than
+        noise of any law, whatever it predicts.
         """
-        return self.assessment.null_gain.total > 0 or self.adjusted_null_p < self.alpha
+        predicted = self.assessment.null_gain.total > 0 or self.adjusted_null_p < self.alpha
+        return predicted and self.adjusted_smooth_p < self.alpha
 
     @property
     def predicts(self) -> bool:

@@ -14,7 +14,7 @@ import numpy as np
 
 from magtensor.errors import DataError
 from magtensor.loop.assessment import Assessment, assess, colours_of
-from magtensor.loop.contribution import put_back, slices
+from magtensor.loop.contribution import happens_once, put_back, slices
 from magtensor.loop.evidence import Whitened
 from magtensor.loop.gates import Candidate
 from magtensor.loop.model import Fitting, Record, State, joint_state
@@ -50,7 +50,8 @@ def _below(candidate: Candidate, state: State) -> list[Candidate]:
     for settings in lower_orders(model.settings, profiled(model.component)):
         lower = replace(model, settings=settings)
         terms = lower.terms(state.excitation).at(residual.samples)
-        assessment = assess(Whitened.of(residual, state.colours.across, state.colours.along, state.terms), terms)
+        now = Whitened.of(residual, state.colours.across, state.colours.along, state.terms)
+        assessment = assess(now, terms, once=happens_once(model))
         below.append(replace(candidate, model=lower, terms=terms, assessment=assessment))
     return below
 
@@ -93,7 +94,9 @@ def _judged(candidate: Candidate, record: Record, state: State, how: Fitting) ->
     residual = put_back(after.residual, terms, after.theta[-1])
     before = replace(after, adopted=(), theta=after.theta[:-1], residual=residual, terms=given)
     colours = colours_of(residual)
-    found = assess(Whitened.of(residual, colours.across, colours.along, given), terms)
+    found = assess(
+        Whitened.of(residual, colours.across, colours.along, given), terms, once=happens_once(candidate.model)
+    )
     moved = [t - s for t, s in zip(after.theta, state.theta, strict=False)]
     theta = found.theta + np.concatenate([*moved, np.zeros(terms.count)])
     return before, terms, replace(found, theta=theta)

@@ -10,6 +10,7 @@ import numpy as np
 
 from magtensor.components import Component
 from magtensor.loop.assessment import WHITE, Assessment, assess
+from magtensor.loop.contribution import happens_once
 from magtensor.loop.evidence import Whitened
 from magtensor.loop.gates import Candidate, explained_before
 from magtensor.loop.log_noise import brought_in, channels_of
@@ -41,10 +42,11 @@ def candidates_of(state: State, models: Sequence[Component], failed: dict[str, s
     beside = explained_before(state)
     candidates = [
         Candidate(
-            model, tried, terms, assessment, p, null_p, alpha, _log_noise(state, model, terms, assessment), beside
+            model, tried, terms, assessment, p, null_p, alpha, _log_noise(state, model, terms, assessment), beside,
+            adjusted_smooth_p=min(1.0, assessment.smooth_p * tried * len(names)),
         )
         for (model, tried, terms, assessment), p, null_p in zip(found, adjusted, null, strict=True)
-    ]
+    ]  # fmt: skip
     return sorted(candidates, key=lambda c: -c.assessment.gain.total)
 
 
@@ -103,7 +105,7 @@ def _looked_at(state: State, scored: Sequence[_Screened], failed: dict[str, str]
         terms = terms_of(each.model, each.settings, state.excitation, failed)
         assert terms is not None
         terms = terms.at(residual.samples)
-        return terms, assess(now, terms)
+        return terms, assess(now, terms, once=happens_once(Adopted(each.model, each.settings)))
 
     chosen = list(distinct.values())
     return [

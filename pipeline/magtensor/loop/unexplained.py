@@ -33,7 +33,9 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
     excess = excess_rms(state)
     line = strongest_line(state, record)
     last = found.steps[-1].candidates if found.steps else ()
-    seen = [c for c in last if c.passes or (c.adjusted_p < c.alpha and c.adjusted_null_p < ALPHA)]
+    seen = [
+        c for c in last if c.passes or (max(c.adjusted_p, c.adjusted_smooth_p) < c.alpha and c.adjusted_null_p < ALPHA)
+    ]
     flagged = lasting(~state.fit.keep, beyond_the_reference(state, record))
     if flagged.any():  # while effects were sought, what lasts was believed
         seen = [c for c in seen if _still_significant(c, state)]

@@ -1,0 +1,105 @@
+"""What happens once has to be sharper than slow noise of any law: a base station that wanders beside the site has no
+steps and no cars."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from loop_cases import Array, linear_state, synthetic
+
+from magtensor.loop.colour import colour_of, smooth_colour
+from magtensor.loop.gates import ALPHA, Candidate
+from magtensor.loop.model import Record
+from magtensor.loop.outcome import why
+from magtensor.loop.screening import candidates_of
+from magtensor.loop.search import with_lines
+from magtensor.registry import Registry
+
+EVENTS = ("reference_step", "passing_source", "scale_step")
+SAMPLES = 3000
+
+
+def wandering(seed: int, tau_s: float, rms_nT: float) -> Array:
+    """Two first-order lags after each other: smoother than noise of 1/f or 1/f^2, and steeper."""
+    rng = np.random.default_rng(seed)
+    course, keep = rng.standard_normal(SAMPLES + round(20 * tau_s)), np.exp(-1.0 / tau_s)
+    for _ in range(2):
+        level, lagged = 0.0, np.empty_like(course)
+        for i, value in enumerate(course):
+            level = keep * level + (1.0 - keep) * value
+            lagged[i] = level
+        course = lagged
+    course = course[-SAMPLES:] - course[-SAMPLES:].mean()
+    out: Array = rms_nT * course / course.std()
+    return out
+
+
+def beside_a_base_station_with(error: Array, seed: int) -> Record:
+    record = synthetic(seed, SAMPLES, turning_s=4.0, noise_nT=0.05)
+    assert record.total_field is not None
+    return replace(record, total_field=record.total_field + error, quiet_field=record.total_field + error)
+
+
+def candidates(record: Record) -> list[Candidate]:
+    registry = Registry.load()
+    models = [registry.find("error_model", name) for name in EVENTS]
+    return candidates_of(with_lines(linear_state(record), record), models, {}, ALPHA)
+
+
+def test_a_base_station_that_wanders_has_no_events() -> None:
+    """In noise of 1/f and 1/f^2 some of its bumps would be impossible; in noise of its own spectrum none is."""
+    impossible = 0
+    for seed in range(3, 8):
+        for found in candidates(beside_a_base_station_with(wandering(seed, 30.0, 0.3), seed)):
+            impossible += found.adjusted_null_p < ALPHA
+            assert found.adjusted_smooth_p > ALPHA, found.model
+            assert not found.passes
+    assert impossible >= 2
+
+
+def test_what_is_no_sharper_than_slow_noise_fails_the_second_gate() -> None:
+    step = np.where(np.arange(SAMPLES) < 1800.5, 0.0, 0.5)
+    found = candidates(beside_a_base_station_with(step, 3))[0]
+    assert found.passes and found.beyond_slow_noise
+    blunt = replace(found, adjusted_smooth_p=ALPHA)
+    assert not blunt.beyond_slow_noise and not blunt.passes
+    assert "slow noise as strong" in why(blunt, None)
+
+
+@pytest.mark.parametrize("step_nT", [1.0, 20.0])
+def test_a_step_of_the_base_station_stands_out_of_that_wandering(step_nT: float) -> None:
+    step = np.where(np.arange(SAMPLES) < 1800.5, 0.0, step_nT)
+    found = {c.model.name: c for c in candidates(beside_a_base_station_with(step + wandering(3, 300.0, 0.1), 3))}
+    assert found["reference_step"].passes
+    assert found["reference_step"].model.settings["time_s"] == pytest.approx(1800.5, abs=5.0)
+
+
+def test_two_steps_stand_out_one_after_the_other() -> None:
+    time = np.arange(SAMPLES)
+    steps = np.where(time < 900.5, 0.0, 3.0) - np.where(time < 2100.5, 0.0, 3.0)
+    found = {c.model.name: c for c in candidates(beside_a_base_station_with(steps, 4))}
+    assert found["reference_step"].adjusted_smooth_p < ALPHA
+
+
+def test_the_smoothed_spectrum_is_that_of_noise_which_no_law_describes() -> None:
+    """White after it in every octave from the second on, where the fitted law is off by more than a factor of two."""
+    series = np.column_stack([wandering(seed, 60.0, 1.0) for seed in range(40)])
+    series += 0.02 * np.random.default_rng(1).standard_normal(series.shape)
+    edges = [8 * 2**k for k in range(9)]
+
+    def octaves(whitened: Array) -> Array:
+        return np.array([np.mean(whitened[a:b] ** 2) for a, b in itertools.pairwise(edges)])
+
+    smoothed = octaves(smooth_colour(series).whiten(series, back=False))
+    np.testing.assert_allclose(smoothed, 1.0, atol=0.2)
+    by_law = octaves(colour_of(series, stiff=True).whiten(series, back=False))
+    assert max(by_law.max(), 1.0 / by_law.min()) > 2.0
+
+
+def test_white_noise_stays_white() -> None:
+    series = np.random.default_rng(2).standard_normal((5000, 6))
+    assert np.mean(smooth_colour(series).whiten(series) ** 2) == pytest.approx(1.0, abs=0.05)
+    assert smooth_colour(series[:20]).power is None
