@@ -60,6 +60,7 @@ def test_two_ways_to_pass(
         tried=tried,
         adjusted_p=adjusted_p,
         adjusted_null_p=null_p,
+        adjusted_smooth_p=0.0,
         assessment=replace(one.assessment, p=p, null_gain=null_gain),
     )
     assert changed.significant is significant

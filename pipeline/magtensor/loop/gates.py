@@ -81,8 +81,11 @@ class Candidate:
 
         By the scatter over blocks alone; or, because a dozen long blocks tell little of what is very unlikely, in noise
         of the colour that the residual has without the model, in which it then predicts held-out blocks as well, if the
-        blocks bear it out as a test of this model alone.
+        blocks bear it out as a test of this model alone. What happens once, at a time sought in the data, has to be
+        sharper than noise of any law besides.
         """
+        if self.adjusted_smooth_p >= self.alpha:
+            return False
         if self.adjusted_p < self.alpha:
             return True
         unlikely = self.adjusted_null_p < UNLIKELY * self.alpha and self.assessment.null_gain.total > 0
@@ -94,11 +97,9 @@ class Candidate:
         explain what the model does: it predicts held-out blocks even so, or that much would be too unlikely.
 
         What happens once, at the beginning or end, is seen by few blocks, and the others cannot predict it closely
-        enough in noise so strong. Of its time, sought in all blocks, nothing was held out: it has to be sharper than
-        noise of any law, whatever it predicts.
+        enough in noise so strong.
         """
-        predicted = self.assessment.null_gain.total > 0 or self.adjusted_null_p < self.alpha
-        return predicted and self.adjusted_smooth_p < self.alpha
+        return self.assessment.null_gain.total > 0 or self.adjusted_null_p < self.alpha
 
     @property
     def predicts(self) -> bool:

@@ -146,6 +146,8 @@ def why(candidate: Candidate, winner: Candidate | None) -> str:
     p = f"p {candidate.adjusted_p:.2g} after correction"
     if candidate.significant and candidate.adjusted_p >= candidate.alpha:
         p += f" by blocks, {candidate.adjusted_null_p:.2g} in noise of the residual's own colour"
+    if candidate.adjusted_smooth_p >= candidate.alpha:
+        p += f", {candidate.adjusted_smooth_p:.2g} in noise with the residual's own spectrum, of whatever law"
     figures = f"{p}, held-out gain {gain.total:.4g} (t {gain.t:.2g})"
     if not candidate.significant:
         return f"not significant: {figures}"
