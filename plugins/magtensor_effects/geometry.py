@@ -1,5 +1,6 @@
 """Error models of where the sensors are. They show in a gradient only: no calibration in a uniform field tests them."""
 
+from dataclasses import replace
 from typing import Annotated
 
 import numpy as np
@@ -29,14 +30,29 @@ def position_error(x: Excitation) -> Terms:
     """A sensor's centre is not where the survey says: it sees the gradient times the offset.
 
     Three coefficients a sensor, true minus stated position. The gradient is that of the whole array, so a shift
-    common to all sensors does not show.
+    common to all sensors does not show; beside an unknown source at the site, an array larger than it should be does
+    not, for a stronger source is the same.
     """
-    _positions(x)
-    each = []
-    for axis, name in enumerate("xyz"):
-        per_mm = np.broadcast_to(1e-3 * x.gradient[:, None, :, axis], x.output.shape)
-        each.append(x.one_each(x.sensed(per_mm), "mm", name))
-    return joined(each)
+    place = _positions(x)
+    per_mm = [x.sensed(np.broadcast_to(1e-3 * x.gradient[:, None, :, axis], x.output.shape)) for axis in range(3)]
+    each = joined([x.one_each(series, "mm", name) for series, name in zip(per_mm, "xyz", strict=True)])
+    if x.site is None:
+        return each
+    larger = sum(series * place[:, axis, None] for axis, series in enumerate(per_mm))
+    return _without_common_part(each, np.reshape(larger, (len(x.time), -1)), place.T.ravel() / np.sum(place**2))
+
+
+def _without_common_part(each: Terms, larger: Array, shares: Array) -> Terms:
+    """Terms of which one combination makes nothing: what it makes, `larger` (N, outputs), is taken off each of them in
+    its share (P,)."""
+    having, outputs = np.flatnonzero(shares), np.arange(larger.shape[1])
+    return replace(
+        each,
+        series=np.hstack([each.series, *(-shares[k] * larger for k in having)]),
+        part_term=np.concatenate([each.part_term, np.repeat(having, len(outputs))]),
+        part_output=np.concatenate([each.part_output, np.tile(outputs, len(having))]),
+        part_series=np.concatenate([each.part_series, each.series.shape[1] + np.arange(len(having) * len(outputs))]),
+    )
 
 
 @error_model(
@@ -59,7 +75,7 @@ def baseline_expansion(x: Excitation, *, channel: Thermometer = "") -> Terms:
 
 @error_model(
     "instrument",
-    needs=("position", "gradient"),
+    needs=("position", "travel"),
     source="Taylor series of the field; dipole on the axis",
     typical="0.83 (d/r)^2 of the gradient beside a dipole: 0.8 % at ten baselines",
 )

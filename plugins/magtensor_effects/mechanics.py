@@ -90,12 +90,12 @@ def crosstalk(x: Excitation) -> Terms:
     """
     if x.position is None:
         raise KeyError("the survey has no positions")
-    coils = []
+    b, coils = x.local_field, []
     for j in range(len(x.sensors)):
-        stray = np.zeros_like(x.field)
+        stray = np.zeros_like(b)
         for i in range(len(x.sensors)):
             if i != j:
-                stray[:, i] = (x.field[:, j] - x.field[:, i]) @ _dipole(x.position[i] - x.position[j])
+                stray[:, i] = (b[:, j] - b[:, i]) @ _dipole(x.position[i] - x.position[j])
         coils.append(x.sensed(1e-6 * stray))
     number = np.arange(len(coils))
     outputs = np.arange(3 * len(coils))

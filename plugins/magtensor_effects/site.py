@@ -12,7 +12,7 @@ from pydantic import Field
 from magtensor.calibration.types import Array
 from magtensor.components import error_model
 from magtensor.loop.excitation import AXES, Excitation
-from magtensor.loop.settings import EventTimes, Range
+from magtensor.loop.settings import EventTimes, Orders, Range
 from magtensor.loop.terms import Terms, joined
 from magtensor.tensor.elements import COMPONENTS, NINE_OF_FIVE
 from magtensor.tensor.geometry import field_polynomials, term_names
@@ -60,7 +60,9 @@ def site_gradient(x: Excitation) -> Terms:
 def fixed_source(
     x: Excitation,
     *,
-    degree: Annotated[int, Field(ge=2, le=4, description="highest degree of the harmonic potential")] = 3,
+    degree: Annotated[
+        int, Orders((3, 4)), Field(ge=2, le=4, description="highest degree of the harmonic potential")
+    ] = 3,
 ) -> Terms:
     """A magnetic thing on the ground near the rig: its field about the rig's centre, as harmonic polynomials.
 

@@ -61,7 +61,7 @@ NEEDED = {
     "site_gradient": ["attitude", "position"],
     "crosstalk": ["position", "gradient"],
     "position_error": ["position", "gradient"],
-    "finite_baseline": ["position", "gradient"],
+    "finite_baseline": ["position", "travel"],
     "baseline_expansion": ["position", "gradient", "temperature*"],
     "reference_scale": ["total_field"],
     "reference_clock": ["total_field"],

@@ -45,6 +45,7 @@ class Excitation:
         attitude: (N, 4) scalar last, platform to world; None where not known.
         lines: Hz, the strongest lines in the residual's spectrum, for models that look for one.
         waveform: (N,) of a source that nobody logged, found in what the sensors share; None where none was.
+        site: (N, S, 3) nT, what the adopted models of the site add to `field` at each sensor; None where they add none.
         station: the base station's own readings; None where `total_field` is all that is known of it.
         part_of: what this is a part of, and the numbers of the samples in it; None for a whole survey.
         courses: name of a thermometer -> its log, and its course without the noise of the log; filled as they are
@@ -65,6 +66,7 @@ class Excitation:
     attitude: Array | None = None
     lines: Sequence[float] = ()
     waveform: Array | None = None
+    site: Array | None = None
     station: Station | None = None
     part_of: tuple[Excitation, NDArray[np.int_]] | None = None
     courses: dict[str, tuple[Array, Array]] = dataclasses.field(default_factory=dict, compare=False, repr=False)
@@ -83,6 +85,7 @@ class Excitation:
             segment=self.segment[samples],
             attitude=None if self.attitude is None else self.attitude[samples],
             waveform=None if self.waveform is None else self.waveform[samples],
+            site=None if self.site is None else self.site[samples],
             part_of=(self, samples),
         )
         vars(chosen)["matrix"] = self.matrix  # that of all samples
@@ -192,6 +195,11 @@ class Excitation:
         return bool(np.array_equal(self.field, np.broadcast_to(self.field[:, :1], self.field.shape)))
 
     @property
+    def local_field(self) -> Array:
+        """(N, S, 3) nT: the field at each sensor with what is known of the site's own."""
+        return self.field if self.site is None else self.field + self.site
+
+    @property
     def field_or_fields(self) -> Array:
         """(N, 3) nT where all sensors see one field, else (N, S, 3)."""
         return self.field[:, 0] if self.uniform else self.field
@@ -241,7 +249,8 @@ class Excitation:
 
     @cached_property
     def gradient(self) -> Array:
-        """(N, 3, 3) nT/m, [i, j] = dB_i / dx_j, by least squares from the field at the sensors; 0 in a uniform field.
+        """(N, 3, 3) nT/m, [i, j] = dB_i / dx_j, by least squares from the field at the sensors and what is known of the
+        site's own; 0 in a uniform field.
 
         Of an array that cannot determine it the smallest that fits.
 
@@ -254,7 +263,7 @@ class Excitation:
         if self.position is None:
             raise KeyError("the survey has no positions, so the field has no known gradient")
         solver = np.linalg.pinv(array_design(self.position, "gradient"))[3:8] / (array_radius(self.position) or 1.0)
-        return full(self.field.reshape(len(self.time), -1) @ solver.T)
+        return full(self.local_field.reshape(len(self.time), -1) @ solver.T)
 
     def lagged(self, series: Array, tau: float) -> Array:
         """As `relaxed`, but straight across gaps: for what goes on between recordings, such as a temperature.

@@ -156,7 +156,7 @@ class Inquiry:
 
     def lacks(self, model: Component) -> list[str]:
         """What the survey lacks for a model."""
-        return [] if model.name == NAME else missing(model, self.first.excitation)
+        return [] if model.name == NAME else missing(model, self.now.state.excitation)
 
     def ranking(self) -> tuple[Candidate, ...]:
         """The most promising models that are open, each with its best settings, by held-out gain."""

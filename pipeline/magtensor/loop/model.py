@@ -241,7 +241,7 @@ def joint_state(
     for round_ in range(MOST_ROUNDS):
         fit = _fit(record, raw, reference, how, keep, known if round_ + 1 < MOST_ROUNDS else None)
         known = fit.coverage  # between the first fit and the last nobody asks
-        x = excitation_of(record, fit, raw, lines)
+        x = beside_the_site(excitation_of(record, fit, raw, lines), adopted, theta)
         if not adopted:
             break
         each = [a.terms(x) for a in adopted]
@@ -250,7 +250,7 @@ def joint_state(
             if any(t.any() for t in theta):
                 raw, reference = without(record, each, theta)
                 fit = _fit(record, raw, reference, how, keep)
-                x = excitation_of(record, fit, raw, lines)
+                x = beside_the_site(excitation_of(record, fit, raw, lines), adopted, theta)
                 each = [a.terms(x) for a in adopted]
         residual = quick(residual_of(fit, raw, reference, how.reference_noise))
         terms = joined(each).at(residual.samples)
@@ -266,7 +266,7 @@ def joint_state(
         step = np.abs(after - before) / np.sqrt(np.maximum(np.diag(estimate.covariance), 1e-300))
         if np.max(step, initial=0.0) < SETTLED:
             fit = _fit(record, raw, reference, how, keep)
-            x = excitation_of(record, fit, raw, lines)
+            x = beside_the_site(excitation_of(record, fit, raw, lines), adopted, theta)
             break
     if estimate is not None:
         shown = without_noise(np.concatenate(theta), estimate)
@@ -274,7 +274,7 @@ def joint_state(
             theta = np.split(shown, edges)
             raw, reference = without(record, each, theta)
             fit = _fit(record, raw, reference, how, keep)
-            x = excitation_of(record, fit, raw, lines)
+            x = beside_the_site(excitation_of(record, fit, raw, lines), adopted, theta)
     entire = residual_of(fit, raw, reference, how.reference_noise)
     residual = quick(entire)
     if adopted:
@@ -390,6 +390,30 @@ def excitation_of(record: Record, fit: JointFit, raw: Array, lines: Sequence[flo
     output = by_sensor(fit.forward, b) + fit.offset
     common = np.repeat((b @ q)[:, None], len(record.sensors), axis=1)
     return record.excitation(output, common, lines, matrix=fit.forward @ q)
+
+
+def beside_the_site(x: Excitation, adopted: Sequence[Adopted], theta: Sequence[Array]) -> Excitation:
+    """What error models see beside those of the site that are adopted: the field of these at each sensor, too.
+
+    Only of sources that are fixed in the world: their field is another one at each sensor, and turns with the attitude.
+    """
+    count, sensors = len(x.time), len(x.sensors)
+    site = np.zeros((count, 3 * sensors))
+    for model, coefficients in zip(adopted, theta, strict=True):
+        if of_the_site(model.component) and np.any(coefficients):
+            terms = model.terms(x)
+            if terms.count == len(coefficients):  # a fit may begin from those of other settings
+                site += terms.contribution(coefficients, 3 * sensors)
+    if not site.any():
+        return x
+    seen = replace(x, site=by_sensor(np.linalg.inv(x.matrix), site.reshape(count, sensors, 3)))
+    vars(seen)["matrix"] = x.matrix
+    return seen
+
+
+def of_the_site(component: Component) -> bool:
+    """Whether a model is of sources that are fixed in the world."""
+    return component.effect == "site" and "attitude" in component.declared({}).needs
 
 
 Progress = Callable[[str], None]

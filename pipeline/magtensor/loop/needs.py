@@ -1,7 +1,9 @@
 """Whether a survey has what an error model needs.
 
 A need is the name of a channel (`acceleration`, `current_*`), a fact of the survey (`attitude`, `position`,
-`total_field`, `rotation`, `gradient`, `waveform`), or several of these of which one will do (`acceleration|attitude`).
+`total_field`, `rotation`, `gradient`, `travel`, `waveform`), or several of these of which one will do
+(`acceleration|attitude`). A gradient is that of the field which an array travels through, or of the calibration site,
+known once an error model of the site is adopted.
 """
 
 from __future__ import annotations
@@ -40,7 +42,8 @@ FACTS: dict[str, Callable[[Excitation], bool]] = {
     "position": lambda x: x.position is not None,
     "total_field": lambda x: x.total_field is not None,
     "rotation": _turns,
-    "gradient": lambda x: not x.uniform,
+    "gradient": lambda x: x.site is not None or not x.uniform,
+    "travel": lambda x: not x.uniform,
     "waveform": lambda x: x.waveform is not None,
 }
 

@@ -23,7 +23,7 @@ from magtensor.loop.found import Search, Step
 from magtensor.loop.gates import ALPHA, OF_THE_LAW, SECOND_ORDER, Candidate
 from magtensor.loop.latent import NAME, SINGLE_STRETCH, Sought, Source, renewed, sought, tried_source
 from magtensor.loop.log_noise import channels_of
-from magtensor.loop.model import Adopted, Fitting, Record, State, joint_state
+from magtensor.loop.model import Adopted, Fitting, Record, State, joint_state, of_the_site
 from magtensor.loop.needs import missing
 from magtensor.loop.overshadowed import overshadowed
 from magtensor.loop.own_fit import at_their_own_fit
@@ -65,11 +65,11 @@ def search(
     say: called with a line about each round.
     """
     if declared:
-        _require_channels(joint_state(record, [], how).excitation, declared)
+        sources = [d for d in declared if of_the_site(d.component)]
+        _require_channels(joint_state(record, [], how).excitation, sources)
+        _require_channels(joint_state(record, sources, how).excitation, declared)
     state = first = joint_state(record, declared, how)
-    testable, not_tested = _testable(first.excitation, models)
     hidden = next((m for m in models if m.name == NAME), None)
-    not_tested.pop(NAME, None)
     shared: Sought | None = None
     standing = trial(record, first, how)
     steps: list[Step] = []
@@ -77,6 +77,7 @@ def search(
     asked = False  # whether something simpler does as well
     for _ in range(most_effects + 2):
         state = with_lines(state, record, lines)
+        testable = _testable(state.excitation, models)
         if len(state.adopted) - len(declared) >= most_effects or state.residual.square() < ROUNDING:
             break
         candidates = candidates_of(state, open_models(testable, state), failed, alpha)
@@ -119,7 +120,7 @@ def search(
     last = _settled(record, state, how)
     if shared is None or shared.objection == SINGLE_STRETCH:  # it may be flagged now
         shared = sought(last, record)
-    found = Search(first, last, tuple(steps), not_tested, failed, record, shared)
+    found = Search(first, last, tuple(steps), _not_tested(last.excitation, models), failed, record, shared)
     while doubted := overshadowed(found, len(declared)):
         places, why = doubted
         name = found.last.adopted[places[0]].name
@@ -127,11 +128,14 @@ def search(
             say(f"taking {name} out again")
         record, state = renewed(record, without_models(record, found.last, places, how), how)
         state = with_lines(state, record, lines)
-        candidates = candidates_of(state, open_models(testable, state), failed, alpha)
+        candidates = candidates_of(state, open_models(_testable(state.excitation, models), state), failed, alpha)
         candidates = at_their_own_fit(candidates, record, state, how)
         steps.append(Step(state, tuple(candidates), None, refused={name: why}))
         last = _settled(record, state, how)
-        found = replace(found, last=last, steps=tuple(steps), record=record, shared=sought(last, record))
+        not_tested = _not_tested(last.excitation, models)
+        found = replace(
+            found, last=last, steps=tuple(steps), not_tested=not_tested, record=record, shared=sought(last, record)
+        )
     return found
 
 
@@ -280,10 +284,15 @@ def _require_channels(x: Excitation, declared: Sequence[Adopted]) -> None:
         )
 
 
-def _testable(x: Excitation, models: Sequence[Component]) -> tuple[list[Component], dict[str, tuple[str, ...]]]:
-    """The models whose channels exist, and what the others miss."""
-    lacking = {model.name: tuple(missing(model, x)) for model in models}
-    return [m for m in models if not lacking[m.name]], {name: lacks for name, lacks in lacking.items() if lacks}
+def _testable(x: Excitation, models: Sequence[Component]) -> list[Component]:
+    """The models that have what they need, beside what is adopted."""
+    return [m for m in models if not missing(m, x)]
+
+
+def _not_tested(x: Excitation, models: Sequence[Component]) -> dict[str, tuple[str, ...]]:
+    """What each of the other models lacks; of a source that nobody logged the loop asks in its own way."""
+    lacking = {model.name: tuple(missing(model, x)) for model in models if model.name != NAME}
+    return {name: lacks for name, lacks in lacking.items() if lacks}
 
 
 def open_models(testable: Sequence[Component], state: State) -> list[Component]:

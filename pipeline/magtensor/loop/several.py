@@ -26,7 +26,7 @@ from magtensor.errors import DataError, NotEnoughData
 from magtensor.loop.assessment import Colours, colours_of, estimated
 from magtensor.loop.delays import cleared
 from magtensor.loop.excitation import Excitation
-from magtensor.loop.model import MOST_ROUNDS, SETTLED, Adopted, Record, share_of
+from magtensor.loop.model import MOST_ROUNDS, SETTLED, Adopted, Record, beside_the_site, share_of
 from magtensor.loop.residual import Levels, Residual, Sighted
 from magtensor.loop.statistics import Estimate
 from magtensor.loop.stretches import borne_out_in
@@ -81,10 +81,11 @@ def surveys_state(of: Together) -> SurveysState:
     NotEnoughData, DataError: as in `fit_surveys`; an error model whose coefficients are others on another survey.
     """
     samples, theta = of.samples, np.zeros(0)
+    parts: list[Array] = []
     lasting = True
     for _ in range(2 * MOST_ROUNDS):
         fit, more = _fitted(of, samples, lasting)
-        each = _terms(of, samples, fit)
+        each = _terms(of, samples, fit, parts)
         residual = residual_of_surveys(fit, samples)
         terms = joined(each).at(residual.samples)
         _require_enough(residual, terms, fit)
@@ -93,16 +94,16 @@ def surveys_state(of: Together) -> SurveysState:
         before = theta if len(theta) else np.zeros(terms.count)
         share = share_of(residual, terms, estimate.theta, colours)
         theta = estimate.seen(before) + share * estimate.theta  # what no data show stays zero
-        samples = _without(of, each, np.split(theta, np.cumsum([e.count for e in each])[:-1]))
+        parts = np.split(theta, np.cumsum([e.count for e in each])[:-1])
+        samples = _without(of, each, parts)
         if np.max(np.abs(theta - before) / np.sqrt(np.maximum(np.diag(estimate.covariance), 1e-300))) < SETTLED:
             if not more:
                 break
             lasting = False
     fit = fit_surveys(samples, **of.options)
     residual = residual_of_surveys(fit, samples)
-    terms = joined(_terms(of, samples, fit)).at(residual.samples)
-    parts = tuple(np.split(theta, np.cumsum([e.count for e in each])[:-1]))
-    return SurveysState(tuple(of.adopted[0]), parts, fit, samples, residual, terms, estimate)
+    terms = joined(_terms(of, samples, fit, parts)).at(residual.samples)
+    return SurveysState(tuple(of.adopted[0]), tuple(parts), fit, samples, residual, terms, estimate)
 
 
 def _require_enough(residual: Residual, terms: Terms, fit: SurveysFit) -> None:
@@ -195,9 +196,11 @@ def _more(samples: int, free: float) -> float:
     return samples / max(samples - free, 1.0)
 
 
-def _terms(of: Together, samples: Samples, fit: SurveysFit) -> list[Terms]:
-    """Those of each model, at the samples of all surveys."""
+def _terms(of: Together, samples: Samples, fit: SurveysFit, theta: Sequence[Array]) -> list[Terms]:
+    """Those of each model, at the samples of all surveys, with the site's field as the coefficients have it so far."""
     views = [_excitation(of, samples, fit, k) for k in range(len(of.records))]
+    if theta:
+        views = [beside_the_site(x, models, theta) for x, models in zip(views, of.adopted, strict=True)]
     found = []
     for models in zip(*of.adopted, strict=True):
         try:
