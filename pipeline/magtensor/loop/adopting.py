@@ -10,7 +10,7 @@ import numpy as np
 
 from magtensor.loop.assessment import estimated, explained
 from magtensor.loop.beginnings import beginning, extent, least_gain, with_beginning
-from magtensor.loop.contribution import KEEP_ALPHA, put_back, significance, slices
+from magtensor.loop.contribution import KEEP_ALPHA, held_out, put_back, significance, slices
 from magtensor.loop.gates import Candidate
 from magtensor.loop.golden import golden
 from magtensor.loop.model import Adopted, Fitting, Record, State, joint_state
@@ -54,12 +54,14 @@ def _spare(state: State, which: int, sensors: tuple[str, ...]) -> bool:
     """Whether a model can do without its coefficients for all but some sensors.
 
     A coefficient may be insignificant because others can stand in for it, as where only differences between sensors
-    are seen (a delay of all of them is a turn of the field): each could go, and not several of them.
+    are seen (a delay of all of them is a turn of the field): each could go, and not several of them. All that go have
+    to predict no more on held-out blocks than what tells two models apart.
     """
-    from scipy.special import chdtri
-
-    gone, seen, lost = _without_others(state, which, sensors)
-    return seen == gone and lost < float(chdtri(gone, KEEP_ALPHA))
+    gone, seen, _ = _without_others(state, which, sensors)
+    if seen < gone:
+        return False
+    gain = held_out(state, _kept(state, which, sensors))
+    return not (gain.total >= SEPARATION and gain.consistent)
 
 
 def _sufficient(state: State, which: int) -> tuple[str, ...] | None:
@@ -84,12 +86,18 @@ def _without_others(state: State, which: int, sensors: tuple[str, ...]) -> tuple
     """Of a model's coefficients for all but some sensors: how many, how many directions of them the survey shows, and
     what is explained no longer without them."""
     assert state.terms is not None
-    part = slices(state)[which]
-    kept = [i for i, s in enumerate(state.terms.sensors) if not part.start <= i < part.stop or s in sensors or s == ""]
+    kept = _kept(state, which, sensors)
     back = put_back(state.residual, state.terms, np.concatenate(state.theta))
     every = estimated(back, state.terms, state.colours)
     fewer = estimated(back, state.terms.only(kept), state.colours)
     return state.terms.count - len(kept), every.rank - fewer.rank, explained(every) - explained(fewer)
+
+
+def _kept(state: State, which: int, sensors: tuple[str, ...]) -> list[int]:
+    """The numbers of all coefficients but those of a model for other sensors."""
+    assert state.terms is not None
+    part = slices(state)[which]
+    return [i for i, s in enumerate(state.terms.sensors) if not part.start <= i < part.stop or s in sensors or s == ""]
 
 
 def _sensors_showing(state: State, which: int) -> tuple[str, ...] | None:

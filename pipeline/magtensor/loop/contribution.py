@@ -13,7 +13,7 @@ from magtensor.loop.evidence import Grams, grams
 from magtensor.loop.model import Adopted, Fitting, Record, State, joint_state
 from magtensor.loop.residual import Residual, taken_off
 from magtensor.loop.settings import EventTimes, profiled
-from magtensor.loop.statistics import family_p, held_out_gain
+from magtensor.loop.statistics import Gain, family_p, held_out_gain
 from magtensor.loop.terms import Terms
 from magtensor.loop.trial import WORST_RISE
 from magtensor.loop.waveform import NAME
@@ -31,6 +31,12 @@ def significance(state: State, chosen: Sequence[int]) -> float:
     """P value of some of the adopted coefficients, the others free: of the residual with their part put back."""
     assert state.terms is not None
     return family_p(_blocks(state), state.terms.sensors, list(chosen))
+
+
+def held_out(state: State, given: Sequence[int]) -> Gain:
+    """What all other coefficients gain on held-out blocks beside the given ones."""
+    assert state.terms is not None
+    return held_out_gain(_blocks(state), state.residual.freedom, np.isin(np.arange(state.terms.count), given))
 
 
 def _blocks(state: State, colours: Colours | None = None) -> Grams:
