@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
 import pytest
-from loop_cases import lasting_effects, scenario, survey_file
+from loop_cases import BASE, lasting_effects, scenario, survey_file, verdict_of
 
 from magtensor import close_loop
 from magtensor.loop.example import example_survey
@@ -119,3 +120,20 @@ def test_iron_that_stood_in_another_field_before_is_no_second_effect(
         assert np.linalg.norm(began) > 20e3
     after = told["error"]["verify"]["after"]["tensor_rms_nT_per_m"]["all"]
     assert after < 1.1 * told["error"]["held_out"]["after"]["tensor_rms_nT_per_m"]["all"]
+
+
+@pytest.mark.parametrize("seed", [7, 12])
+def test_what_dies_away_is_no_response_to_the_temperature_that_began_with_it(seed: int, tmp_path: Path) -> None:
+    """A response with a beginning does as well: the beginning was fitted to the folds that should judge it."""
+    effect = {"type": "warm_up", "tau_s": 150.0, "rms_nT": 1.0, "sensors": ["S1", "S4"]}
+    variation = {"diurnal": {"amplitude_nT": [5.0, -20.0, 8.0]}, "irregular": {"rms_nT": 1.5, "time_s": 400.0}}
+    changes: dict[str, Any] = {
+        "rate_Hz": 5.0,
+        "instrument": BASE["instrument"] | {"seed": seed + 900},
+        "field": BASE["field"] | {"variation": variation},
+    }
+    models = ["warm_up", "temperature_rate", "temperature_offset", "offset_drift"]
+    (adopted,) = verdict_of(tmp_path, scenario(seed, effect, **changes), models=models)["adopted"]
+    assert adopted["error_model"] == "warm_up" and adopted["sensors"] == ["S1", "S4"]
+    assert adopted["settings"]["tau_s"] == pytest.approx(150.0, rel=0.1)
+    assert "temperature_rate" in adopted["indistinguishable_from"]

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field, replace
 from magtensor.components import Component
 from magtensor.errors import DataError
 from magtensor.loop.adopting import adopt, narrowed, polished
+from magtensor.loop.assessment import estimated, explained
 from magtensor.loop.beginnings import beginning
 from magtensor.loop.changing_matrix import channel_instead
 from magtensor.loop.contribution import agrees, eliminate, happens_once, without_models
@@ -33,6 +34,7 @@ from magtensor.loop.separation import SEPARATION, fold_gain, separated
 from magtensor.loop.settings import AnyChannel, profiled
 from magtensor.loop.several_logs import worse_log
 from magtensor.loop.spectrum import spectral_lines
+from magtensor.loop.terms import joined
 from magtensor.loop.trial import Trial, on_the_folds_of, per_sample, trial
 
 MOST_EFFECTS = 8
@@ -322,10 +324,11 @@ def simplest(best: Candidate, possible: Sequence[Candidate], state: State) -> tu
 
     Nor are two told apart by less than the next order of what both explain, a channel that nobody wrote a model for
     from the model that names its effect by less than that one's law may miss, and two logs of one cause by the noise of
-    the worse one.
+    the worse one. What a response began with was fitted to all blocks, of which none was held out for it: from a model
+    that needs none it is told apart by the likelihood of all of them.
 
-    Simplest is more of what was adopted already, with another setting; then what has the fewest coefficients, and of
-    those what lasts; a response that lags by half the survey or longer comes after both.
+    Simplest is more of what was adopted already, with another setting; then what has the fewest coefficients, what it
+    began with among them, and of those what lasts; a response that lags by half the survey or longer comes after both.
     A model that slow noise could explain is named, and not chosen before one that it could not.
     """
     colours = best.assessment.colours
@@ -339,17 +342,35 @@ def simplest(best: Candidate, possible: Sequence[Candidate], state: State) -> tu
         named = generic(best.model) and not generic(other.model) and _channel(best) == _channel(other)
         behind = reference.over(found).total
         alike = behind <= (OF_THE_LAW if named else SECOND_ORDER) * reference.total
+        alike = alike or (begun(best) > begun(other) and _as_likely(best, other, state))
         if alike or not separated(reference, found, spare) or worse_log(best, other, behind, state):
             equal.append(other)
     known = {a.name for a in state.adopted}
 
     def complexity(c: Candidate) -> tuple[bool, bool, bool, int, bool, float]:
         slow, new, once = _hardly_begun(c, state.excitation), c.model.name not in known, happens_once(c.model)
-        return generic(c.model), slow, new, c.assessment.estimate.rank, once, -c.assessment.gain.total
+        return generic(c.model), slow, new, c.assessment.estimate.rank + begun(c), once, -c.assessment.gain.total
 
     chosen = min((c for c in equal if c is best or c.passes), key=complexity)
     chosen = lasting_instead(chosen, possible)
     return chosen, tuple(sorted({c.model.name for c in equal if c is not chosen} - {chosen.model.name}))
+
+
+def begun(candidate: Candidate) -> int:
+    """With how many values a response began out of equilibrium."""
+    found = beginning(candidate.model.component, candidate.model.settings)
+    return sum(bool(candidate.model.settings[name]) for name in found[0]) if found else 0
+
+
+def _as_likely(best: Candidate, other: Candidate, state: State) -> bool:
+    """Whether another model explains as much as the best one, on all blocks together."""
+
+    def whole(c: Candidate) -> float:
+        before = c.before or state
+        together = c.terms if before.terms is None else joined([before.terms, c.terms])
+        return explained(estimated(before.residual, together, best.assessment.colours))
+
+    return whole(best) - whole(other) < SEPARATION
 
 
 def lasting_instead(chosen: Candidate, possible: Sequence[Candidate]) -> Candidate:
