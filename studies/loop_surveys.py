@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -136,10 +137,13 @@ def _described(effect: str, rms: float, seed: int) -> list[dict[str, Any]]:
     return [{"type": "offset_step", "nT": nT.tolist(), "time_s": [at]} for at, nT in both]
 
 
-def recorded(simulation: Simulated) -> Record:
-    """Its samples as the loop sees them: written to a file, read and prepared by the recipe's stages."""
+def recorded(simulation: Simulated, change: Callable[[Path], None] | None = None) -> Record:
+    """Its samples as the loop sees them: written to a file, which `change` may alter, read and prepared by the recipe's
+    stages."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "survey.h5"
         write(simulation, path)
+        if change is not None:
+            change(path)
         planned = plan(parse_yaml(STAGES, "study"), survey=path)
         return record_of(run(planned, empty_survey(planned)).survey)
