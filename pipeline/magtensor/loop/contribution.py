@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from magtensor.calibration.types import Array
-from magtensor.loop.assessment import WHITE, Colours, block_count
-from magtensor.loop.evidence import Grams, grams
+from magtensor.loop.assessment import WHITE, Colours, block_count, estimated_in, explained
+from magtensor.loop.evidence import Grams, Whitened, grams
 from magtensor.loop.model import Adopted, Fitting, Record, State, joint_state
 from magtensor.loop.residual import Residual, taken_off
 from magtensor.loop.settings import EventTimes, profiled
@@ -57,6 +58,25 @@ def removal(state: State, *places: int) -> tuple[float, float]:
         others[slices(state)[place]] = False
     before, after = held_out_gain(_blocks(state, WHITE), state.residual.freedom, others).rms
     return before * state.residual.scale, after * state.residual.scale
+
+
+def of_all_alike(state: State, place: int) -> bool:
+    """Whether an adopted model explains nothing of what differs between the sensors: all it does may be done by the
+    total field that they are compared with."""
+    assert state.terms is not None
+    own = slices(state)[place]
+    if state.residual.across is None or state.residual.along is None:
+        return False
+    from scipy.special import chdtrc
+
+    order = np.arange(state.terms.count)
+    mine = state.terms.only(range(own.start, own.stop))
+    back = put_back(state.residual, mine, state.theta[place])
+    others = state.terms.only(int(i) for i in order[(order < own.start) | (order >= own.stop)])
+    white = Whitened.of(replace(back, along=None), state.colours.across, state.colours.along, others, over_time=False)
+    with_it, without = estimated_in(white, mine), estimated_in(white, None)
+    gained = explained(with_it) - explained(without)
+    return with_it.rank == without.rank or float(chdtrc(with_it.rank - without.rank, max(gained, 0.0))) > KEEP_ALPHA
 
 
 def put_back(residual: Residual, terms: Terms, theta: Array) -> Residual:

@@ -17,7 +17,7 @@ from magtensor.loop.adopting import adopt, narrowed, polished
 from magtensor.loop.assessment import estimated, explained
 from magtensor.loop.beginnings import beginning
 from magtensor.loop.changing_matrix import channel_instead
-from magtensor.loop.contribution import agrees, eliminate, happens_once, without_models
+from magtensor.loop.contribution import agrees, eliminate, happens_once, of_all_alike, without_models
 from magtensor.loop.exchange import looked_at_again, simpler
 from magtensor.loop.excitation import Excitation
 from magtensor.loop.found import Search, Step
@@ -257,6 +257,11 @@ def _kept(record: Record, before: Trial, chosen: Candidate, how: Fitting) -> tup
     same = [a for a in after.state.adopted[:which] if set(a.sensors or record.sensors) & set(acts_on)]
     if not channels_of(model, after.state.excitation) and already(same, model.component, model.settings):
         return None, "fitted, its settings are those of what is adopted already"
+    if _hardly_begun(chosen, after.state.excitation) and of_all_alike(after.state, which):
+        return (
+            None,
+            "fitted, all sensors show it alike, through a lag in which a channel may be any drift of the reference",
+        )
     if not agrees(after.state, which):
         return None, "fitted, its coefficients are not what its settings assume"
     if not before.likelier(after):
