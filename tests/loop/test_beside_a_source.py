@@ -84,3 +84,13 @@ def test_a_source_that_is_not_fitted_yet_adds_nothing(record: Record) -> None:
     x = joint_state(record, [], Fitting()).excitation
     assert beside_the_site(x, [model], [np.zeros(0)]) is x
     assert beside_the_site(x, [model], [np.ones(3)]) is x  # coefficients of other settings
+
+
+def test_both_are_fitted_from_nothing(record: Record) -> None:
+    """The first round knows no gradient yet: its rounding is no regressor, of which coefficients could be found."""
+    registry = Registry.load()
+    models = [("fixed_source", {"degree": 4}), ("position_error", {})]
+    adopted = [Adopted(registry.find("error_model", name), settings) for name, settings in models]
+    state = joint_state(record, adopted, Fitting())
+    assert state.residual.square() < 1.5
+    assert np.abs(state.theta[1]).max() < 2.0  # mm

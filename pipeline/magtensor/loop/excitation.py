@@ -262,6 +262,8 @@ class Excitation:
 
         if self.position is None:
             raise KeyError("the survey has no positions, so the field has no known gradient")
+        if self.site is None and self.uniform:
+            return np.zeros((len(self.time), 3, 3))  # not its rounding, which a coefficient could be found of
         solver = np.linalg.pinv(array_design(self.position, "gradient"))[3:8] / (array_radius(self.position) or 1.0)
         return full(self.local_field.reshape(len(self.time), -1) @ solver.T)
 
