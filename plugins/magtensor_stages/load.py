@@ -11,7 +11,7 @@ from pydantic import Field
 
 from magtensor.components import stage
 from magtensor.errors import DataError, NotEnoughData, UsageError, did_you_mean
-from magtensor.survey import checks
+from magtensor.survey import checks, recorded_numbers, repeated, time_base
 from magtensor.survey.flags import Flag, flag_ranges
 from magtensor.survey.model import AXES, Survey
 
@@ -100,7 +100,7 @@ def _clock(seconds: float) -> str:
 
 def _increasing(survey: Survey, time_faults: str, where: str, notes: list[str]) -> Survey:
     time = survey.time
-    onward = checks.moves_on(time)
+    onward = time_base.moves_on(time)
     if onward.all():
         return survey
     first = int(np.flatnonzero(~onward)[0])
@@ -139,7 +139,7 @@ def _reference_times(survey: Survey, time_faults: str, where: str, notes: list[s
         raise DataError("every value is missing", where=f"{where}: reference/total_field")
     if np.median(values[known]) > 0:
         known &= values > 0  # a proton magnetometer without a signal writes zero
-    onward = checks.moves_on(time[known])
+    onward = time_base.moves_on(time[known])
     if not onward.all():
         at = int(np.flatnonzero(known)[np.flatnonzero(~onward)[0]])
         what = f"the time of the reference's sample {at}, {_clock(float(time[at]))}, does not move on"
@@ -149,7 +149,7 @@ def _reference_times(survey: Survey, time_faults: str, where: str, notes: list[s
             )
         notes.append(f"{int((~onward).sum())} reference samples left out; {what}")
     keep = np.flatnonzero(known)[onward]
-    held = checks.held_readings(time[keep], values[keep])
+    held = repeated.held_readings(time[keep], values[keep])
     if not known.all():
         notes.append(f"{int((~known).sum())} of {len(time)} reference samples have no value and are left out")
     if held is not None:
@@ -301,7 +301,7 @@ def _flagged(
     good = survey.good_by_sensor.copy()
     flags: list[Flag] = []
     repeating = "the same numbers for longer than chance explains"
-    frozen = checks.frozen(field)
+    frozen = repeated.frozen(field)
     if frozen.any():
         flags += flag_ranges(time, frozen, by=BY, reason="frozen: no sensor gives a new number")
         good &= ~frozen[:, None]
@@ -318,9 +318,9 @@ def _flagged(
                 np.asarray(rails.any(axis=1)),
                 f"saturated on axis {', '.join(AXES[a] for a in np.flatnonzero(rails.any(axis=0)))}",
             ),
-            (checks.stuck(own, others), f"stuck: {repeating}"),
+            (repeated.stuck(own, others), f"stuck: {repeating}"),
             *(
-                (checks.stuck_axis(own, a, others) & ~rails[:, a], f"axis {axis} stuck: {repeating}")
+                (repeated.stuck_axis(own, a, others) & ~rails[:, a], f"axis {axis} stuck: {repeating}")
                 for a, axis in enumerate(AXES)
             ),
         ):
@@ -332,7 +332,7 @@ def _flagged(
 def _readings(survey: Survey, notes: list[str]) -> dict[str, Any]:
     """Which rows hold readings, where some are filled in; nothing where the sensors are read in different rows."""
     field = survey.values("b_raw")
-    reading = ~np.column_stack([checks.filled_in(field[:, s]) for s in range(field.shape[1])])
+    reading = ~np.column_stack([repeated.filled_in(field[:, s]) for s in range(field.shape[1])])
     if reading.all():
         return {}
     own = reading.mean(axis=0)
@@ -348,7 +348,7 @@ def _readings(survey: Survey, notes: list[str]) -> dict[str, Any]:
 def _described(survey: Survey) -> dict[str, Any]:
     """`time` and `b_raw` with what was found of them: rate, gaps, quantisation, share of new samples."""
     time, field = survey["time"], survey["b_raw"]
-    found = checks.sampling(survey.time)
+    found = time_base.sampling(survey.time)
     facts = {
         "rate_Hz": found.rate_Hz,
         "jitter_s": found.jitter_s,
@@ -357,8 +357,8 @@ def _described(survey: Survey) -> dict[str, Any]:
         "missing_samples": found.missing,
     }
     raw = field.values
-    steps = [max(checks.resolution(raw[:, s, a]) for a in range(3)) for s in range(raw.shape[1])]
-    fresh = [checks.new_share(raw[:, s]) for s in range(raw.shape[1])]
+    steps = [max(recorded_numbers.resolution(raw[:, s, a]) for a in range(3)) for s in range(raw.shape[1])]
+    fresh = [repeated.new_share(raw[:, s]) for s in range(raw.shape[1])]
     return {
         "time": (("time",), time.values, {**time.attrs, **facts}),
         "b_raw": (field.dims, raw, {**field.attrs, "quantisation_nT": steps, "new_sample_share": fresh}),

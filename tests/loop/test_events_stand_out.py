@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from loop_cases import Array, linear_state, synthetic
+from scipy.signal import lfilter
 
 from magtensor.loop.colour import colour_of, smooth_colour
 from magtensor.loop.gates import ALPHA, Candidate
@@ -26,12 +27,7 @@ def wandering(seed: int, tau_s: float, rms_nT: float) -> Array:
     """Two first-order lags after each other: smoother than noise of 1/f or 1/f^2, and steeper."""
     rng = np.random.default_rng(seed)
     course, keep = rng.standard_normal(SAMPLES + round(20 * tau_s)), np.exp(-1.0 / tau_s)
-    for _ in range(2):
-        level, lagged = 0.0, np.empty_like(course)
-        for i, value in enumerate(course):
-            level = keep * level + (1.0 - keep) * value
-            lagged[i] = level
-        course = lagged
+    course = lfilter([(1.0 - keep) ** 2], [1.0, -2.0 * keep, keep**2], course)
     course = course[-SAMPLES:] - course[-SAMPLES:].mean()
     out: Array = rms_nT * course / course.std()
     return out

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from test_load import Load, Variables, changed
 
-from magtensor.survey.checks import filled_in
+from magtensor.survey.repeated import filled_in
 
 
 def turning(samples: int, noise_nT: float, seed: int = 3, step_s: float = 0.01) -> np.ndarray:

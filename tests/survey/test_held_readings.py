@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from test_load import Load, Variables
 
-from magtensor.survey.checks import held_readings
+from magtensor.survey.repeated import held_readings
 
 
 def base(time: np.ndarray, seed: int = 1, noise: float = 0.1, digits: int = 2) -> np.ndarray:

@@ -17,8 +17,8 @@ from magtensor.loop.gates import Candidate
 from magtensor.loop.latent import NAME, renewed, sought, tried_source
 from magtensor.loop.model import Fitting, Record, State
 from magtensor.loop.outcome import why
+from magtensor.loop.rivals import simplest
 from magtensor.loop.screening import candidates_of
-from magtensor.loop.search import simplest
 from magtensor.loop.settings import AnyChannel, profiled
 from magtensor.loop.trial import on_the_folds_of, trial
 

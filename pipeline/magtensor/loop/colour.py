@@ -129,8 +129,8 @@ def smooth_colour(series: Array, freedom: float | None = None) -> Colour:
     if n < _LEAST:
         return _white(columns, share)
     power = np.maximum(_spectrum(columns, share), 1e-300)
-    edges = np.minimum(_OCTAVE * 2 ** np.arange(int(np.log2(n)) + 1), n)
-    edges = np.concatenate([[1], edges[edges < n // 2], [n]])
+    octaves = _OCTAVE * 2 ** np.arange(int(np.log2(n)))
+    edges = np.concatenate([[1], octaves[octaves < n // 2], [n]])
     place = np.log(np.arange(1, n))
     level, middle = (np.add.reduceat(values, edges[:-1] - 1) / np.diff(edges) for values in (power, place))
     course = np.log(level)

@@ -14,14 +14,12 @@ from dataclasses import dataclass, field, replace
 from magtensor.components import Component
 from magtensor.errors import DataError
 from magtensor.loop.adopting import adopt, narrowed, polished
-from magtensor.loop.assessment import estimated, explained
-from magtensor.loop.beginnings import beginning
 from magtensor.loop.changing_matrix import channel_instead
 from magtensor.loop.contribution import agrees, eliminate, happens_once, of_all_alike, without_models
 from magtensor.loop.exchange import looked_at_again, simpler
 from magtensor.loop.excitation import Excitation
 from magtensor.loop.found import Search, Step
-from magtensor.loop.gates import ALPHA, OF_THE_LAW, SECOND_ORDER, Candidate
+from magtensor.loop.gates import ALPHA, Candidate
 from magtensor.loop.latent import NAME, SINGLE_STRETCH, Sought, Source, renewed, sought, tried_source
 from magtensor.loop.log_noise import channels_of
 from magtensor.loop.model import Adopted, Fitting, Record, State, joint_state, of_the_site
@@ -29,16 +27,12 @@ from magtensor.loop.needs import missing
 from magtensor.loop.overshadowed import overshadowed
 from magtensor.loop.own_fit import at_their_own_fit
 from magtensor.loop.profiling import already, repeatable
+from magtensor.loop.rivals import containing, hardly_begun, simplest
 from magtensor.loop.screening import candidates_of, generic
-from magtensor.loop.separation import SEPARATION, fold_gain, separated
-from magtensor.loop.settings import AnyChannel, profiled
-from magtensor.loop.several_logs import worse_log
 from magtensor.loop.spectrum import spectral_lines
-from magtensor.loop.terms import joined
 from magtensor.loop.trial import Trial, on_the_folds_of, per_sample, trial
 
 MOST_EFFECTS = 8
-SLOW = 0.5  # of the survey: a longer lag is no better known than a drift
 ROUNDING = 1e-4  # mean square of the whitened residual: far below the least noise that any sensor is believed to have
 
 
@@ -68,8 +62,9 @@ def search(
     """
     if declared:
         sources = [d for d in declared if of_the_site(d.component)]
-        _require_channels(joint_state(record, [], how).excitation, sources)
-        _require_channels(joint_state(record, sources, how).excitation, declared)
+        _require_channels(joint_state(record, [], how).excitation, sources or declared)
+        if sources:  # a gradient is known with them
+            _require_channels(joint_state(record, sources, how).excitation, declared)
     state = first = joint_state(record, declared, how)
     hidden = next((m for m in models if m.name == NAME), None)
     shared: Sought | None = None
@@ -217,7 +212,7 @@ def _first_kept(
     while passing := [c for c in candidates if c.passes and c.model.name not in refused]:
         best = max(passing, key=lambda c: c.assessment.gain.total)
         possible = [c for c in candidates if c.predicts and c.model.name not in refused]
-        best = _containing(best, possible, before.state)
+        best = containing(best, possible, before.state)
         chosen, rivals = simplest(best, possible, before.state)
         if say is not None:
             say(f"adopting {chosen.model.name}")
@@ -257,7 +252,7 @@ def _kept(record: Record, before: Trial, chosen: Candidate, how: Fitting) -> tup
     same = [a for a in after.state.adopted[:which] if set(a.sensors or record.sensors) & set(acts_on)]
     if not channels_of(model, after.state.excitation) and already(same, model.component, model.settings):
         return None, "fitted, its settings are those of what is adopted already"
-    if _hardly_begun(chosen, after.state.excitation) and of_all_alike(after.state, which):
+    if hardly_begun(chosen, after.state.excitation) and of_all_alike(after.state, which):
         return (
             None,
             "fitted, all sensors show it alike, through a lag in which a channel may be any drift of the reference",
@@ -306,109 +301,6 @@ def open_models(testable: Sequence[Component], state: State) -> list[Component]:
     """Those that are not in already, or can be in more than once."""
     taken = {a.name for a in state.adopted}
     return [m for m in testable if m.name not in taken or repeatable(m)]
-
-
-def _containing(best: Candidate, possible: Sequence[Candidate], state: State) -> Candidate:
-    """The best of the models that predict more and leave `best` nothing to predict; `best` where there is none.
-
-    Slow noise could explain such a model, but not `best`, which is a part of what it explains: a drift, say, that is
-    more than a warming up.
-    """
-    more = [c for c in possible if c.assessment.gain.total > best.assessment.gain.total + SEPARATION]
-    for other in sorted(more, key=lambda c: -c.assessment.gain.total):
-        colours = other.assessment.colours
-        before = other.before or state
-        alone = fold_gain(before, colours, other.terms)
-        if fold_gain(before, colours, other.terms, best.terms).total - alone.total < SEPARATION:
-            return other
-    return best
-
-
-def simplest(best: Candidate, possible: Sequence[Candidate], state: State) -> tuple[Candidate, tuple[str, ...]]:
-    """The simplest of the models that the held-out blocks do not separate from the best, and the others' names.
-
-    Nor are two told apart by less than the next order of what both explain, a channel that nobody wrote a model for
-    from the model that names its effect by less than that one's law may miss, and two logs of one cause by the noise of
-    the worse one. What a response began with was fitted to all blocks, of which none was held out for it: from a model
-    that needs none it is told apart by the likelihood of all of them.
-
-    Simplest is more of what was adopted already, with another setting; then what has the fewest coefficients, what it
-    began with among them, and of those what lasts; a response that lags by half the survey or longer comes after both.
-    A model that slow noise could explain is named, and not chosen before one that it could not.
-    """
-    colours = best.assessment.colours
-    reference = fold_gain(best.before or state, colours, best.terms)
-    equal: list[Candidate] = [best]
-    for other in possible:
-        if other is best:
-            continue
-        spare = max(other.assessment.estimate.rank - best.assessment.estimate.rank, 0)
-        found = fold_gain(other.before or state, colours, other.terms)
-        named = generic(best.model) and not generic(other.model) and _channel(best) == _channel(other)
-        behind = reference.over(found).total
-        alike = behind <= (OF_THE_LAW if named else SECOND_ORDER) * reference.total
-        alike = alike or (begun(best) > begun(other) and _as_likely(best, other, state))
-        if alike or not separated(reference, found, spare) or worse_log(best, other, behind, state):
-            equal.append(other)
-    known = {a.name for a in state.adopted}
-
-    def complexity(c: Candidate) -> tuple[bool, bool, bool, int, bool, float]:
-        slow, new, once = _hardly_begun(c, state.excitation), c.model.name not in known, happens_once(c.model)
-        return generic(c.model), slow, new, c.assessment.estimate.rank + begun(c), once, -c.assessment.gain.total
-
-    chosen = min((c for c in equal if c is best or c.passes), key=complexity)
-    chosen = lasting_instead(chosen, possible)
-    return chosen, tuple(sorted({c.model.name for c in equal if c is not chosen} - {chosen.model.name}))
-
-
-def begun(candidate: Candidate) -> int:
-    """With how many values a response began out of equilibrium."""
-    found = beginning(candidate.model.component, candidate.model.settings)
-    return sum(bool(candidate.model.settings[name]) for name in found[0]) if found else 0
-
-
-def _as_likely(best: Candidate, other: Candidate, state: State) -> bool:
-    """Whether another model explains as much as the best one, on all blocks together."""
-
-    def whole(c: Candidate) -> float:
-        before = c.before or state
-        together = c.terms if before.terms is None else joined([before.terms, c.terms])
-        return explained(estimated(before.residual, together, best.assessment.colours))
-
-    return whole(best) - whole(other) < SEPARATION
-
-
-def lasting_instead(chosen: Candidate, possible: Sequence[Candidate]) -> Candidate:
-    """What lasts in the place of something that happens once, if it predicts more with no more coefficients.
-
-    A slip soon after the start is a delay for all but the first samples: the few blocks that it misses scatter what it
-    is behind by, so that it seems no worse than the best, from which the delay itself is told apart.
-    """
-    if not happens_once(chosen.model):
-        return chosen
-    better = [
-        c
-        for c in possible
-        if c.passes
-        and not happens_once(c.model)
-        and not generic(c.model)
-        and c.assessment.estimate.rank <= chosen.assessment.estimate.rank
-        and c.assessment.gain.total > chosen.assessment.gain.total
-    ]
-    return max(better, key=lambda c: c.assessment.gain.total, default=chosen)
-
-
-def _hardly_begun(candidate: Candidate, x: Excitation) -> bool:
-    """Whether a response lags by half the survey or more: what it followed was over before it began, and a channel seen
-    through such a lag can be any drift."""
-    found = beginning(candidate.model.component, candidate.model.settings)
-    return found is not None and float(candidate.model.settings[found[1].lag]) > SLOW * x.duration
-
-
-def _channel(candidate: Candidate) -> str:
-    """The channel that a model follows; "" where it follows none."""
-    settings, marks = candidate.model.settings, profiled(candidate.model.component).items()
-    return next((str(settings[name]) for name, mark in marks if isinstance(mark, AnyChannel)), "")
 
 
 def with_lines(state: State, record: Record, lines: Sequence[float] | None = None) -> State:

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from magtensor.errors import DataError, UsageError
-from magtensor.survey import checks
+from magtensor.survey import time_base
+from magtensor.survey.recorded_numbers import resolution
 from magtensor.survey.sections import SurveySection
 from magtensor.survey.source import Source
 from magtensor.survey.tables import Column, Tables, existing
@@ -158,7 +159,7 @@ def column_facts(name: str, column: Column, number: int) -> ColumnFacts:
         median=float(np.median(finite)),
         high=float(finite.max()),
         missing=1.0 - finite.size / numbers.size,
-        resolution=checks.resolution(values.reshape(len(values), -1)[:, 0].astype(np.float64)) if values.ndim else 0.0,
+        resolution=resolution(values.reshape(len(values), -1)[:, 0].astype(np.float64)) if values.ndim else 0.0,
     )
 
 
@@ -171,14 +172,14 @@ def sampling_sentences(tables: Tables) -> list[str]:
         if len(seconds) < 2:
             found.append(f"{column.name}: one sample")
             continue
-        onward = checks.moves_on(seconds)
+        onward = time_base.moves_on(seconds)
         good = seconds[onward]
         if len(good) < 2:
             found.append(f"{column.name}: the times do not increase")
             continue
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", RuntimeWarning)
-            rhythm = checks.sampling(good)
+            rhythm = time_base.sampling(good)
         text = f"{column.name}: {len(seconds)} samples over {good[-1] - good[0]:.6g} s, {rhythm.rate_Hz:.6g} Hz"
         text += f", {rhythm.gaps} gaps (longest {rhythm.longest_gap_s:.6g} s)" if rhythm.gaps else ", no gaps"
         if not onward.all():

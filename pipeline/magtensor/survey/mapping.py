@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from magtensor.errors import DataError
 from magtensor.survey.altitude import dipole_decrease, pressure_height
 from magtensor.survey.canonical import expected
-from magtensor.survey.checks import moves_on
 from magtensor.survey.flags import Flag, flag_ranges
 from magtensor.survey.model import AXES, Survey
 from magtensor.survey.quantities import Rows, interpolated, listed, quantity, rows_of
@@ -26,6 +25,7 @@ from magtensor.survey.sections import (
     SegmentSection,
 )
 from magtensor.survey.source import Source
+from magtensor.survey.time_base import moves_on
 from magtensor.survey.times import since, split_since, to_epoch
 from magtensor.units import convert
 

@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtensor.errors import DataError
-from magtensor.survey.checks import EARTH_FIELD_NT, moves_on
+from magtensor.survey.checks import EARTH_FIELD_NT
 from magtensor.survey.tables import Column, Tables
+from magtensor.survey.time_base import moves_on
 from magtensor.survey.times import numbers_to_seconds, parse_instant, split_since
 from magtensor.survey.vectors import Floats, Triple, candidates, column_values, numbers_of
 from magtensor.units import UnitError, canonical_unit, convert, dimension, is_unit

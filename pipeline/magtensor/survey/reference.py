@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from magtensor.survey.checks import resolution
+from magtensor.survey.recorded_numbers import resolution
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
