@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from loop_cases import BASE, adopted_names, scenario, verdict_of
 
-from magtensor.loop import search
+from magtensor.loop import rivals, search
 from magtensor.loop.model import Adopted, Fitting, Record, State
 from magtensor.registry import Registry
 
@@ -54,9 +54,9 @@ def candidate(name: str, gain: float, *, rank: int = 4, passes: bool = True) -> 
 )
 def test_a_slip_is_no_simpler_than_a_delay_that_predicts_more(other: Any, instead: bool) -> None:
     slip = candidate("lag_step", 27600.0)
-    assert search.lasting_instead(slip, [slip, other]) is (other if instead else slip)
+    assert rivals.lasting_instead(slip, [slip, other]) is (other if instead else slip)
 
 
 def test_what_lasts_stays() -> None:
     delay, drift = candidate("sampling_lag", 100.0), candidate("clock_drift", 200.0)
-    assert search.lasting_instead(delay, [delay, drift]) is delay
+    assert rivals.lasting_instead(delay, [delay, drift]) is delay
