@@ -197,16 +197,16 @@ def apply_and_refine(
         fitted, dated = at_date_of(survey, calibration, restored(calibration), date)
         apart = scatter_for(survey, calibration) if scatter is None else scatter
         fitted = with_scatter(fitted, apart)
-        adopted, theta, means = stored_effects(calibration, planned.registry)
-        adopted = on_its_clock(adopted, theta, means, calibration, as_fitted(calibration, fitted), survey)
-        adopted, theta, refuted = recorded_alike(adopted, theta, means, as_fitted(calibration, fitted), survey)
-        before, survey = survey, cleaned(survey, as_fitted(calibration, fitted), adopted, theta, means)
+        adopted, theta, origins = stored_effects(calibration, planned.registry)
+        adopted = on_its_clock(adopted, theta, origins, calibration, as_fitted(calibration, fitted), survey)
+        adopted, theta, refuted = recorded_alike(adopted, theta, origins, as_fitted(calibration, fitted), survey)
+        before, survey = survey, cleaned(survey, as_fitted(calibration, fitted), adopted, theta, origins)
         if judge:
             known = calibration.values("calibration/noise_std") if "calibration/noise_std" in calibration else None
             survey = flagged(survey, fitted, known, uniform=uniform)
         words = {
             "not_taken_off": left_in(survey, adopted),
-            "extrapolated": extrapolated(before, calibration, adopted, means),
+            "extrapolated": extrapolated(before, calibration, adopted, origins),
             "begins_anew": begun_anew(adopted, calibration),
             "not_on_this_survey": refuted,
         }
@@ -220,7 +220,7 @@ def apply_and_refine(
             b, noise = survey.values("calibrated/b"), calibration.values("calibration/noise_std")
             position = calibration.values("calibration/position")
             assembly = stored_assembly(calibration)
-            off = taken_off(calibration, fitted, before, survey, adopted, theta, means)
+            off = taken_off(calibration, fitted, before, survey, adopted, theta, origins)
             survey = survey.merged(assembled(assembly, b, position, noise, fitted, refinement, off))
     elif refine_rotation:
         raise DataError(

@@ -196,7 +196,7 @@ def taken_off(
     clean: Survey,
     adopted: Sequence[Adopted],
     theta: Sequence[Array],
-    means: Mapping[str, Array],
+    origins: Mapping[str, Array],
 ) -> TakenOff | None:
     """What the errors of the coefficients do to a survey that they were taken off; None where they are not known.
 
@@ -216,7 +216,7 @@ def taken_off(
     if COVARIANCE not in calibration or not applied:
         return None
     sensors = len(fitted.matrix)
-    record = record_of(survey, means=means, every=True)
+    record = record_of(survey, origins=origins, every=True)
     raw = np.asarray(clean.values("b_raw"), dtype=float)
     raw = np.where(np.isfinite(raw), raw, np.nanmean(raw, axis=0))  # a lost sample must not spoil its neighbours
     x = record.excitation(raw, as_fitted(calibration, fitted).apply(raw))

@@ -26,8 +26,8 @@ class Unit:
 
 GRAVITY = 9.80665  # standard gravity, m s-2, exact by definition
 _DEGREE = np.pi / 180.0
-_FLUX, _LENGTH, _TIME, _TEMPERATURE = "magnetic flux density", "length", "time", "temperature"
-_CURRENT, _VOLTAGE, _ANGLE, _RATE = "electric current", "voltage", "angle", "angular rate"
+_FLUX, _LENGTH, _TIME, TEMPERATURE = "magnetic flux density", "length", "time", "temperature"
+CURRENT, _VOLTAGE, _ANGLE, _RATE = "electric current", "voltage", "angle", "angular rate"
 _ACCELERATION, _PRESSURE, _PURE, _COUNT, _FREQUENCY = "acceleration", "pressure", "pure number", "counts", "frequency"
 
 # Base units: nT, m, s, degC, A, V, rad, rad s-1, m s-2, Pa, 1, counts, Hz, nT m-1. Spelt as the CF convention does.
@@ -50,12 +50,12 @@ UNITS: dict[str, Unit] = {
     "min": Unit(_TIME, 60.0),
     "h": Unit(_TIME, 3600.0),
     "d": Unit(_TIME, 86400.0),
-    "degC": Unit(_TEMPERATURE, 1.0),
-    "K": Unit(_TEMPERATURE, 1.0, -273.15),
-    "degF": Unit(_TEMPERATURE, 5.0 / 9.0, -160.0 / 9.0),
-    "A": Unit(_CURRENT, 1.0),
-    "mA": Unit(_CURRENT, 1e-3),
-    "uA": Unit(_CURRENT, 1e-6),
+    "degC": Unit(TEMPERATURE, 1.0),
+    "K": Unit(TEMPERATURE, 1.0, -273.15),
+    "degF": Unit(TEMPERATURE, 5.0 / 9.0, -160.0 / 9.0),
+    "A": Unit(CURRENT, 1.0),
+    "mA": Unit(CURRENT, 1e-3),
+    "uA": Unit(CURRENT, 1e-6),
     "V": Unit(_VOLTAGE, 1.0),
     "mV": Unit(_VOLTAGE, 1e-3),
     "uV": Unit(_VOLTAGE, 1e-6),

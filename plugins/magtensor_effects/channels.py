@@ -76,9 +76,9 @@ def channel_response(
 ) -> Terms:
     """The output follows a power of any logged channel, through a lag, as an offset or as a factor.
 
-    The channel's mean is taken off before the power. One coefficient an axis; nine a sensor for a channel with three
-    components. Rivals: the model that names the cause (`temperature_offset`, `current_field`, ...), identical to this
-    one at power 1.
+    The power is about zero for a current and for what goes both ways, else about the channel's mean. One coefficient an
+    axis; nine a sensor for a channel with three components. Rivals: the model that names the cause
+    (`temperature_offset`, `current_field`, ...), identical to this one at power 1.
     """
     name = ANY.pick(x, channel)
     course = x.channel(name, lag_s, delayed, smooth, at_start) ** power

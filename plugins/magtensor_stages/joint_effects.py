@@ -31,13 +31,13 @@ class Effects:
     """Declared effects that were fitted.
 
     Attributes:
-        adopted: the error models; theta: the coefficients of each; means: of the channels, which were taken off.
+        adopted: the error models; theta: the coefficients of each; origins: of the channels, which were taken off.
         found: the calibration with the joint covariance.
     """
 
     adopted: Sequence[Adopted]
     theta: Sequence[np.ndarray]
-    means: Mapping[str, np.ndarray]
+    origins: Mapping[str, np.ndarray]
     found: WithCoefficients
 
     def variables(self, survey: Survey) -> dict[str, Any]:
@@ -45,14 +45,14 @@ class Effects:
         from magtensor.effect_errors import coefficient_variables
         from magtensor.loop.stored import effect_variables
 
-        own = effect_variables(self.adopted, self.theta, self.means, survey)
+        own = effect_variables(self.adopted, self.theta, self.origins, survey)
         return own | coefficient_variables(self.found, survey.sensors)
 
     def cleaned(self, survey: Survey) -> Survey:
         """A survey with the effects taken off."""
         from magtensor.loop.stored import cleaned
 
-        return cleaned(survey, self.found.calibration, self.adopted, self.theta, self.means)
+        return cleaned(survey, self.found.calibration, self.adopted, self.theta, self.origins)
 
 
 def surveys_fitted(
@@ -63,7 +63,7 @@ def surveys_fitted(
     chosen: Chosen,
     options: Mapping[str, Any],
 ) -> tuple[SurveysState, Mapping[str, np.ndarray]]:
-    """C, the offsets and the coefficients of effects, fitted together, and the means of the channels.
+    """C, the offsets and the coefficients of effects, fitted together, and the origins of the channels.
 
     Raises:
         DataError: an error model needs what a survey does not show, or makes no sense in this fit.
@@ -81,16 +81,16 @@ def surveys_fitted(
         _require_needs(adopted, record, name)
     clocks = [adopted, *(begun_with(adopted, started(first), one) for _, one in surveys[1:])]
     conventional = not field.measured and field.declared is None
-    return surveys_state(Together(samples, records, clocks, options, conventional)), records[0].means
+    return surveys_state(Together(samples, records, clocks, options, conventional)), records[0].origins
 
 
 def _records(surveys: Sequence[tuple[str, Survey]], uses: Sequence[np.ndarray], measured: bool) -> list[Record]:
-    """Of each survey, the means of the first one's channels taken off all of them."""
+    """Of each survey, the origins of the first one's channels taken off all of them."""
     from magtensor.loop.record import record_of
 
     records = [record_of(surveys[0][1], use=uses[0])]
     for (_, one), use in zip(surveys[1:], uses[1:], strict=True):
-        records.append(record_of(one, records[0].means, use=use))
+        records.append(record_of(one, records[0].origins, use=use))
     each = {n: np.concatenate([r.logged[n] for r in records if n in r.logged]) for n in records[0].logged}
     changing = [n for n, values in each.items() if np.ptp(values, axis=0).max(initial=0.0) > 0]
     if not measured:

@@ -120,8 +120,10 @@ def close_loop(
     outcome |= {"unexplained": left, "held_out": {"before": before, "after": after}}
     if doubt is not None:
         outcome["calibration"] = doubt.facts()
-    clean = cleaned(survey, calibration, last.adopted, last.theta, record.means)
-    given = common_frame(clean, calibration, "joint") | effect_variables(last.adopted, last.theta, record.means, survey)
+    clean = cleaned(survey, calibration, last.adopted, last.theta, record.origins)
+    given = common_frame(clean, calibration, "joint") | effect_variables(
+        last.adopted, last.theta, record.origins, survey
+    )
     given |= errors
     before_fit = np.linalg.norm(survey.values("b_raw"), axis=2) - survey.values("total_field")[:, None]
     given["residual/total_field_before"] = (("time", "sensor"), before_fit, {"units": "nT", "long_name": "|b_raw| - F"})

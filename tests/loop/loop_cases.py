@@ -151,7 +151,7 @@ def synthetic(
         quiet_field=total,
         sensors=tuple(f"S{i + 1}" for i in range(sensors)),
         logged={},
-        means={},
+        origins={},
         units={},
         run=np.zeros(samples, dtype=int),
         segment=np.zeros(samples, dtype=int),

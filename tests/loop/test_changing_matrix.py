@@ -18,10 +18,10 @@ ALPHA = 0.001
 
 
 def with_channels(record: Record, **channels: Array) -> Record:
-    """The record with logged channels, their means taken off."""
-    means = {name: np.asarray(values.mean(axis=0)) for name, values in channels.items()}
-    logged = {name: values - means[name] for name, values in channels.items()}
-    return replace(record, logged=logged, means=means, units=dict.fromkeys(channels, "1"))
+    """The record with logged channels, their origins taken off."""
+    origins = {name: np.asarray(values.mean(axis=0)) for name, values in channels.items()}
+    logged = {name: values - origins[name] for name, values in channels.items()}
+    return replace(record, logged=logged, origins=origins, units=dict.fromkeys(channels, "1"))
 
 
 def turned(record: Record, number: int, angle: Array) -> Record:

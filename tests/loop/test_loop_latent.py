@@ -233,7 +233,7 @@ def test_one_sensor_alone_and_two_sensors() -> None:
 def test_what_follows_a_channel_is_not_blamed_on_a_hidden_source() -> None:
     record = with_source()
     logged = {"pump": WAVE + 0.2 * np.random.default_rng(5).standard_normal(N)}
-    known = replace(record, logged=logged, means={"pump": np.zeros(())}, units={"pump": "A"})
+    known = replace(record, logged=logged, origins={"pump": np.zeros(())}, units={"pump": "A"})
     assert "pump" in objection(known)
     tried = sought(linear_state(known), known, may_follow=True)  # the channel was adopted, and leaves much of it
     assert tried is not None and tried.significant and not tried.objection
@@ -260,7 +260,7 @@ def test_what_an_effect_may_have_left_is_no_source(alike: bool) -> None:
     pump = np.cos(np.arange(N) / 33.0)
     effect = VECTORS if alike else np.random.default_rng(9).standard_normal((4, 3))
     record = synthetic(2, N, added=3.0 * WAVE[:, None, None] * VECTORS + 12.0 * pump[:, None, None] * effect)
-    known = replace(record, logged={"pump": pump}, means={"pump": np.zeros(())}, units={"pump": "A"})
+    known = replace(record, logged={"pump": pump}, origins={"pump": np.zeros(())}, units={"pump": "A"})
     response = Adopted(Registry.load().find("error_model", "channel_response"), {"channel": "pump"})
     state = joint_state(known, [response], Fitting())
     found = sought(state, known)

@@ -39,7 +39,7 @@ def survey_with(seed: int, current: Array, added: Array) -> Record:
     """A survey that logs a current, with `added` (N, S, 3) nT in the outputs."""
     record = synthetic(seed, samples=SAMPLES, noise_nT=0.2, added=added)
     logged = {"current_pump": current - current.mean()}
-    return replace(record, logged=logged, means={"current_pump": current.mean()}, units={"current_pump": "A"})
+    return replace(record, logged=logged, origins={"current_pump": current.mean()}, units={"current_pump": "A"})
 
 
 def looked_at(seed: int, current: Array, added: Array) -> Candidate:

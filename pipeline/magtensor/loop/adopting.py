@@ -18,6 +18,7 @@ from magtensor.loop.scoring import Scorer
 from magtensor.loop.separation import SEPARATION
 from magtensor.loop.settings import Forms, Frequencies, Range, profiled
 from magtensor.loop.terms import Terms
+from magtensor.loop.waveform import NAME
 
 POLISH = 0.1  # of a setting, or of the width of a line, to either side
 _SWEEPS = 6  # over all settings, where two models of one kind are in
@@ -48,6 +49,21 @@ def narrowed(record: Record, state: State, which: int, sensors: tuple[str, ...],
     theta = list(state.theta)
     theta[which] = theta[which][keep]
     return joint_state(record, models, how, theta)
+
+
+def on_those_that_show(record: Record, state: State, how: Fitting, fixed: int) -> State:
+    """Refit with every model that was found on those of its sensors that show it beside all others.
+
+    When it was adopted, what had no name yet on one sensor was in the field that all of them see, and so seemed to be a
+    little of it on each.
+    """
+    for which in range(fixed, len(state.adopted)):
+        if state.adopted[which].name == NAME or len(state.adopted) == fixed + 1:
+            continue
+        sensors = _sensors_showing(state, which)
+        if sensors is not None and _spare(state, which, sensors):
+            state = narrowed(record, state, which, sensors, how)
+    return state
 
 
 def _spare(state: State, which: int, sensors: tuple[str, ...]) -> bool:

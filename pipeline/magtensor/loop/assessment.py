@@ -8,8 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from magtensor.calibration.types import Array
-from magtensor.loop.colour import Colour, colour_of, smooth_colour
+from magtensor.loop.colour import Colour, colour_of
 from magtensor.loop.evidence import Grams, Whitened, grams, grams_in, normal
+from magtensor.loop.own_noise import OwnNoise
 from magtensor.loop.residual import Residual, taken_off
 from magtensor.loop.statistics import Estimate, Gain, family_p, focused_gain, held_out_gain, own_information, solve
 from magtensor.loop.terms import Terms, joined
@@ -67,13 +68,12 @@ class Assessment:
         null_gain: the same in noise whose colour is found without them: what the null hypothesis says of the noise.
         focused, null_focused: both again on folds that know equally much of the terms, which are short where these act;
             None where a few blocks know nearly all.
-        p: that all coefficients are zero, from the scatter over blocks.
+        p: that all coefficients are zero, from the scatter over blocks; of what happens once, from noise of each
+            sensor's own spectrum.
         null_p: the same from what they explain in noise of the colour that the residual has without them, stronger
             where it is all in one sensor with more slow noise than the others.
         colours: under the hypothesis that the terms are real.
         theta: the likeliest coefficients, with any colour: where a joint fit begins.
-        smooth_p: of what happens once, the same as `null_p` in noise with the smoothed spectrum of that residual,
-            whatever its law; 0 of what lasts.
     """
 
     estimate: Estimate
@@ -85,7 +85,6 @@ class Assessment:
     null_p: float
     colours: Colours
     theta: Array
-    smooth_p: float = 0.0
 
 
 def block_count(samples: int) -> int:
@@ -100,9 +99,9 @@ def assess(now: Whitened, terms: Terms, *, once: bool = False) -> Assessment:
     that a flexible model could follow must count as noise. How much the terms explain, and how well they compare with
     others, is asked in the colour of what they leave: seen in the first colour, a strong slow effect is itself noise.
 
-    What happens once, with a time sought in the data, wants a third. Any wandering has a place that looks like a step
-    or a bump, by far too large for the laws that the other two follow. But a step is coherent over all frequencies at
-    which it stands above the white noise, and the wandering is not.
+    What happens once lies in two or three blocks, whose scatter tells nothing, and its time was sought in the data: any
+    wandering, of a base station or of one bad sensor, has a place that looks like a step or a bump, by far too large
+    for a law that is one for all. So it is judged in noise of each sensor's own spectrum (`own_noise`).
 
     Parameters
     ----------
@@ -125,13 +124,10 @@ def assess(now: Whitened, terms: Terms, *, once: bool = False) -> Assessment:
     stronger = slow_noise_of(sensor, taken_off(residual, together, best.theta), now.across)
     null_p = _p_of(null, first, max(stronger, 1.0))
     blocks = grams(residual, together, colours.across, colours.along, count)
-    p = family_p(blocks, together.sensors, own)
+    p = OwnNoise(residual, given).p_value(terms) if once else family_p(blocks, together.sensors, own)
     gain = held_out_gain(blocks, residual.freedom, blocked)
     focused = focused_gain(blocks, residual.freedom, blocked)
-    smooth_p = _smooth_p(residual, given, terms, sensor) if once else 0.0
-    return Assessment(
-        _estimate(blocks), gain, null_gain, focused, null_focused, p, null_p, colours, best.theta, smooth_p
-    )
+    return Assessment(_estimate(blocks), gain, null_gain, focused, null_focused, p, null_p, colours, best.theta)
 
 
 @dataclass(frozen=True)
@@ -177,20 +173,6 @@ def _p_of(blocks: Grams, given: int, variance: float) -> float:
     every, without = solve(n[0], y[0], scale), solve(n[0, :given, :given], y[0, :given], scale[:given])
     gained = max(explained(every) - explained(without), 0.0) / variance
     return float(chdtrc(max(every.rank - without.rank, 1), gained))
-
-
-def _smooth_p(residual: Residual, given: Terms | None, terms: Terms, sensor: int | None) -> float:
-    """P value of terms in noise with the residual's own spectrum, smoothed; across, that of one sensor if given."""
-    white = Colour(None, 1.0)
-    across = along = white
-    if residual.across is not None:
-        own = slice(None) if sensor is None else slice(3 * sensor, 3 * sensor + 3)
-        columns = residual.across[:, own]
-        across = smooth_colour(columns, columns.shape[1] * (1.0 - 3.0 / len(residual.noise)))
-    if residual.along is not None:
-        along = smooth_colour(residual.along)
-    blocks = grams_in(Whitened.of(residual, across, along, given), terms)
-    return _p_of(blocks, 0 if given is None else given.count, 1.0)
 
 
 def _only_sensor(blocks: Grams, given: int, terms: Terms) -> int | None:

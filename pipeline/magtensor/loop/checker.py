@@ -265,7 +265,7 @@ def _record(x: Excitation, raw: Array) -> Record:
         quiet_field=x.total_field,
         sensors=x.sensors,
         logged=x.logged,
-        means={name: np.zeros(values.shape[1:]) for name, values in x.logged.items()},
+        origins={name: np.zeros(values.shape[1:]) for name, values in x.logged.items()},
         units=x.units,
         run=x.run,
         segment=x.segment,

@@ -21,8 +21,6 @@ _COLUMNS = 16  # filtered at a time
 _SHORT = np.array([1.0, 3.0, 10.0])  # time constants in samples
 _LEAST = 64  # samples, of fewer the noise is taken for white
 _LEAST_OF_SHORT = 100  # of them in a survey, or it is not short
-_OCTAVE = 4  # frequencies in the lowest one
-_SMOOTHING = 8  # rounds in which a course between the middles of octaves gets their levels
 _SETTLING = 3  # rounds in which a colour and what goes with the field settle
 
 
@@ -114,32 +112,6 @@ def colour_of(series: Array, freedom: float | None = None, *, stiff: bool = Fals
     if relative[1] < 1.05:
         return Colour(None, white)
     return Colour(relative, white)
-
-
-def smooth_colour(series: Array, freedom: float | None = None) -> Colour:
-    """The mean spectrum of the columns of (N, K) itself, smoothed over octaves: noise of whatever law.
-
-    Parameters
-    ----------
-    series, freedom: as in `colour_of`.
-    """
-    columns = series.reshape(len(series), -1)
-    n, k = columns.shape
-    share = (freedom or k) / k
-    if n < _LEAST:
-        return _white(columns, share)
-    power = np.maximum(_spectrum(columns, share), 1e-300)
-    octaves = _OCTAVE * 2 ** np.arange(int(np.log2(n)))
-    edges = np.concatenate([[1], octaves[octaves < n // 2], [n]])
-    place = np.log(np.arange(1, n))
-    level, middle = (np.add.reduceat(values, edges[:-1] - 1) / np.diff(edges) for values in (power, place))
-    course = np.log(level)
-    for _ in range(_SMOOTHING):
-        smooth = np.exp(np.interp(place, middle, course))
-        course += np.log(level / (np.add.reduceat(smooth, edges[:-1] - 1) / np.diff(edges)))
-    smooth = np.exp(np.interp(place, middle, course))
-    white = float(smooth.min())
-    return Colour(np.concatenate([smooth[:1], smooth]) / white, white)
 
 
 def _white(columns: Array, share: float) -> Colour:

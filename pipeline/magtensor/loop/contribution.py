@@ -12,6 +12,7 @@ from magtensor.calibration.types import Array
 from magtensor.loop.assessment import WHITE, Colours, block_count, estimated_in, explained
 from magtensor.loop.evidence import Grams, Whitened, grams
 from magtensor.loop.model import Adopted, Fitting, Record, State, joint_state
+from magtensor.loop.own_noise import OwnNoise
 from magtensor.loop.residual import Residual, taken_off
 from magtensor.loop.settings import EventTimes, profiled
 from magtensor.loop.statistics import Gain, family_p, held_out_gain
@@ -98,7 +99,12 @@ def eliminate(record: Record, state: State, how: Fitting, fixed: int) -> tuple[S
         assert state.terms is not None
         blocks, freedom = _blocks(state), state.residual.freedom
         parts = slices(state)[fixed:]
-        values = [family_p(blocks, state.terms.sensors, list(range(p.start, p.stop))) for p in parts]
+        values = [
+            _of_an_event(state, fixed + i)
+            if happens_once(state.adopted[fixed + i])
+            else family_p(blocks, state.terms.sensors, list(range(p.start, p.stop)))
+            for i, p in enumerate(parts)
+        ]
         order = np.arange(state.terms.count)
         gains = [held_out_gain(blocks, freedom, (order < p.start) | (order >= p.stop)).total for p in parts]
         rises = [_rise(state, fixed + i) for i in range(len(parts))]
@@ -116,6 +122,18 @@ def eliminate(record: Record, state: State, how: Fitting, fixed: int) -> tuple[S
         dropped.append(state.adopted[weakest].name)
         state = without_models(record, state, [weakest], how)
     return state, tuple(dropped)
+
+
+def _of_an_event(state: State, place: int) -> float:
+    """P value of an adopted model of what happened once, beside the others, all times corrected for at which it might
+    have: its part in two or three blocks has no scatter."""
+    assert state.terms is not None
+    own = slices(state)[place]
+    mine = state.terms.only(range(own.start, own.stop))
+    others = [i for i in range(state.terms.count) if not own.start <= i < own.stop]
+    noise = OwnNoise(put_back(state.residual, mine, state.theta[place]), state.terms.only(others) if others else None)
+    times = [g.count for g in profiled(state.adopted[place].component).values() if isinstance(g, EventTimes)]
+    return noise.p_value(mine) * float(np.prod(times))
 
 
 def _rise(state: State, place: int) -> float:

@@ -36,7 +36,7 @@ def corrected_raw(
 
     Parameters
     ----------
-    record: all samples of the survey, channels with the calibration's means taken off.
+    record: all samples of the survey, channels with the calibration's origins taken off.
     calibration: C and o.
     adopted: the effects; theta: their coefficients.
     good: (N,) samples from which others may be interpolated and the waveform of a source that nobody logged be found.

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from magtensor.loop.assessment import Assessment
+from magtensor.loop.contribution import happens_once
 from magtensor.loop.model import Adopted, State
 from magtensor.loop.residual import taken_off
 from magtensor.loop.settings import AnyChannel, profiled
@@ -34,8 +35,6 @@ class Candidate:
         assessment: of the terms, given the models adopted before.
         adjusted_p: after the correction for settings and for the number of models.
         adjusted_null_p: the same for what it explains in noise of the residual's own colour.
-        adjusted_smooth_p: the same for what it explains in noise with the residual's own spectrum, smoothed; 0 of what
-            lasts.
         alpha: what the adjusted p has to stay below.
         log_noise: what noise in the log of its channel, brought in by a model adopted before, lets it gain.
         beside: sum of squares that the models adopted before explain to first order.
@@ -52,14 +51,11 @@ class Candidate:
     log_noise: float = 0.0
     beside: float = 0.0
     before: State | None = None
-    adjusted_smooth_p: float = 0.0
 
     def among(self, models: int) -> Candidate:
         """The same, found among so many models rather than by itself."""
-        p, null_p, smooth_p = (
-            min(1.0, each * max(models, 1)) for each in (self.adjusted_p, self.adjusted_null_p, self.adjusted_smooth_p)
-        )
-        return replace(self, adjusted_p=p, adjusted_null_p=null_p, adjusted_smooth_p=smooth_p)
+        p, null_p = (min(1.0, each * max(models, 1)) for each in (self.adjusted_p, self.adjusted_null_p))
+        return replace(self, adjusted_p=p, adjusted_null_p=null_p)
 
     @property
     def of_the_log(self) -> bool:
@@ -79,15 +75,14 @@ class Candidate:
     def significant(self) -> bool:
         """Whether noise does not explain it, all that was tried considered.
 
-        By the scatter over blocks alone; or, because a dozen long blocks tell little of what is very unlikely, in noise
-        of the colour that the residual has without the model, in which it then predicts held-out blocks as well, if the
-        blocks bear it out as a test of this model alone. What happens once, at a time sought in the data, has to be
-        sharper than noise of any law besides.
+        By its p value alone. Or, because a dozen long blocks tell little of what is very unlikely, in noise of the
+        colour that the residual has without the model, in which it then predicts held-out blocks as well, if the
+        blocks bear it out as a test of this model alone. The p value of what happens once is not from blocks.
         """
-        if self.adjusted_smooth_p >= self.alpha:
-            return False
         if self.adjusted_p < self.alpha:
             return True
+        if happens_once(self.model):
+            return False
         unlikely = self.adjusted_null_p < UNLIKELY * self.alpha and self.assessment.null_gain.total > 0
         return unlikely and self.assessment.p < ALONE and self.assessment.p * self.tried < AMONG_ITS_SETTINGS
 
@@ -115,16 +110,17 @@ class Candidate:
         """Whether a model that acts in a part of the survey only predicts one part of that from the others.
 
         Then the folds of equal length are but one or two figures, which may gain much and tell no scatter. The short
-        folds in which it acts are not asked unless both the scatter over blocks and noise of the residual's own colour
-        are out of the question, and in noise of that colour it has to predict them as well. Only of what follows a
+        folds in which it acts are not asked unless both its p value and noise of the residual's own colour leave no
+        doubt, and in noise of that colour it has to predict them as well. Only of what happens once or follows a
         channel: a drift is everywhere, and short folds at its end say no more than that neighbours are alike.
         """
-        if not any(isinstance(grid, AnyChannel) for grid in profiled(self.model.component).values()):
+        channel = any(isinstance(grid, AnyChannel) for grid in profiled(self.model.component).values())
+        if not channel and not happens_once(self.model):
             return False
         focused, null = self.assessment.focused, self.assessment.null_focused
         if focused is None or null is None or self.assessment.gain.total <= 0:
             return False
-        unlikely = self.adjusted_p < self.alpha and self.adjusted_null_p < UNLIKELY * self.alpha
+        unlikely = self.adjusted_p < self.alpha and self.adjusted_null_p < self.alpha
         return unlikely and focused.consistent and null.total > 0
 
     @property

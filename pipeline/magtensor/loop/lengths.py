@@ -35,7 +35,7 @@ def averaged_otherwise(
 
     Parameters
     ----------
-    record: all samples of the survey, channels with the calibration's means taken off.
+    record: all samples of the survey, channels with the calibration's origins taken off.
     adopted: the effects, `averaging` among them; theta: their coefficients; good: (N,) the samples that count.
     """
     others = [i for i, a in enumerate(adopted) if a.name != AVERAGING]

@@ -45,7 +45,7 @@ class Record:
         raw: (N, S, 3) nT; total_field: (N,) nT or None.
         quiet_field: (N,) nT, the total field without the reference's own noise, for regressors; None without one.
         sensors: names.
-        logged: channels at the samples, their means taken off; means: those; units: of each.
+        logged: channels at the samples, their origins taken off; origins: those; units: of each.
         run, segment: (N,) as in Excitation.
         position: (S, 3) m or None; attitude: (N, 4) or None.
         samples: (N,) their numbers in the survey.
@@ -61,7 +61,7 @@ class Record:
     quiet_field: Array | None
     sensors: tuple[str, ...]
     logged: Mapping[str, Array]
-    means: Mapping[str, Array]
+    origins: Mapping[str, Array]
     units: Mapping[str, str]
     run: NDArray[np.int_]
     segment: NDArray[np.int_]

@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from magtensor.loop.contribution import removal
+from magtensor.loop.contribution import happens_once, removal
 from magtensor.loop.found import Search, Step
 from magtensor.loop.gates import Candidate
 from magtensor.loop.model import Adopted, Record
-from magtensor.loop.settings import Beginning, Forms, Frequencies, Range, profiled
+from magtensor.loop.settings import Beginning, EventTimes, Forms, Frequencies, Range, profiled
 from magtensor.loop.waveform import NAME
 
 
@@ -50,7 +50,7 @@ def judgement(candidate: Candidate) -> dict[str, Any]:
     gain, focused = candidate.assessment.gain, candidate.assessment.focused
     return {
         "error_model": candidate.model.name,
-        "settings": {k: _plain(v) for k, v in candidate.model.settings.items()},
+        "settings": _settings(candidate.model),
         "p": candidate.adjusted_p,
         "held_out_gain": float(gain.total),
         "t": float(gain.t),
@@ -100,7 +100,7 @@ def _adopted(found: Search, index: int) -> dict[str, Any]:
         "error_model": model.name,
         "kind": model.component.effect,
         "sensors": [s for s in state.excitation.sensors if s in set(sensors)],
-        "settings": {k: _plain(v) for k, v in model.settings.items()},
+        "settings": _settings(model),
         "coefficients": [
             {"name": n, "sensor": s, "value": float(v), "std": float(d), "units": u}
             for n, s, v, d, u in zip(names, sensors, state.theta[index], std, units, strict=True)
@@ -108,6 +108,13 @@ def _adopted(found: Search, index: int) -> dict[str, Any]:
         "evidence": {"held_out_rms_before_nT": before, "held_out_rms_after_nT": after, "z": z_of(p)},
         "indistinguishable_from": rivals,
     }
+
+
+def _settings(model: Adopted) -> dict[str, Any]:
+    """The settings of a model, times in their order."""
+    found = {k: _plain(v) for k, v in model.settings.items()}
+    times = [name for name, grid in profiled(model.component).items() if isinstance(grid, EventTimes)]
+    return found | dict(zip(times, sorted(found[name] for name in times), strict=True))
 
 
 def _plain(value: Any) -> Any:
@@ -146,8 +153,8 @@ def why(candidate: Candidate, winner: Candidate | None) -> str:
     p = f"p {candidate.adjusted_p:.2g} after correction"
     if candidate.significant and candidate.adjusted_p >= candidate.alpha:
         p += f" by blocks, {candidate.adjusted_null_p:.2g} in noise of the residual's own colour"
-    if candidate.adjusted_smooth_p >= candidate.alpha:
-        p += f", {candidate.adjusted_smooth_p:.2g} in noise with the residual's own spectrum, of whatever law"
+    if happens_once(candidate.model):
+        p += " in noise of each sensor's own spectrum"
     figures = f"{p}, held-out gain {gain.total:.4g} (t {gain.t:.2g})"
     if not candidate.significant:
         return f"not significant: {figures}"

@@ -13,6 +13,7 @@ from magtensor.loop.quiet import quieted
 from magtensor.loop.station import Station
 from magtensor.survey.model import Survey
 from magtensor.survey.reference import spikes
+from magtensor.units import CURRENT, TEMPERATURE, UNITS
 
 NOT_CHANNELS = (
     "time", "sensor", "axis", "b_raw", "position", "good", "segment", "attitude", "quaternion", "total_field",
@@ -24,7 +25,7 @@ GAP = 5.0  # median steps: a longer one begins a new run
 
 def record_of(
     survey: Survey,
-    means: Mapping[str, Array] | None = None,
+    origins: Mapping[str, Array] | None = None,
     *,
     every: bool = False,
     use: NDArray[np.bool_] | None = None,
@@ -33,7 +34,7 @@ def record_of(
 
     Args:
         survey: with `b_raw` and, where there is one, `total_field`.
-        means: what to take off each channel (a stored calibration's); the survey's own means if None.
+        origins: what to take off each channel (a stored calibration's); this survey's own if None.
         every: all samples, flagged or not, as a correction needs; else those a fit may use.
         use: (N,) those samples, where a fit of several surveys has chosen them. Channels that never change are then
             kept: another survey may hold another value.
@@ -56,9 +57,9 @@ def record_of(
         elif not finite.all():
             logged[name] = _filled(time, values, finite)
     keep = np.flatnonzero(use)
-    if means is None:
-        means = {name: np.asarray(values[keep].mean(axis=0)) for name, values in logged.items()}
-    centred = {name: values - means[name] for name, values in logged.items() if name in means}
+    if origins is None:
+        origins = {name: origin(values[keep], units[name]) for name, values in logged.items()}
+    centred = {name: values - origins[name] for name, values in logged.items() if name in origins}
     if not steady:  # what never changes says nothing
         centred = {n: v for n, v in centred.items() if np.ptp(v[keep], axis=0).max(initial=0.0) > 0}
     segment = np.asarray(survey.values("segment"), dtype=int) if "segment" in survey else np.zeros(len(time), dtype=int)
@@ -72,7 +73,7 @@ def record_of(
         station=None if total_field is None else station,
         sensors=tuple(survey.sensors),
         logged=centred,
-        means={n: means[n] for n in centred},
+        origins={n: origins[n] for n in centred},
         units={n: units[n] for n in centred},
         run=runs(time, segment),
         segment=segment,
@@ -81,6 +82,20 @@ def record_of(
         samples=np.arange(len(time)),
     )
     return whole if len(keep) == len(time) else whole.at(keep)
+
+
+def origin(values: Array, units: str) -> Array:
+    """What is taken off a channel (N, ...), (...): zero where it has one of its own, else the mean.
+
+    Heat goes with the square of a current, not with that of its excess over the mean; and what goes both ways is zero
+    in between. A temperature's zero is a convention.
+    """
+    mean, known = values.mean(axis=0), UNITS.get(units)
+    dimension = "" if known is None else known.dimension
+    if dimension == TEMPERATURE:
+        return np.asarray(mean)
+    both_ways = (values.min(axis=0) <= 0.0) & (values.max(axis=0) >= 0.0)
+    return np.where((dimension == CURRENT) | both_ways, 0.0, mean)
 
 
 def channels_of(survey: Survey) -> tuple[dict[str, Array], dict[str, str]]:

@@ -43,7 +43,6 @@ def candidates_of(state: State, models: Sequence[Component], failed: dict[str, s
     candidates = [
         Candidate(
             model, tried, terms, assessment, p, null_p, alpha, _log_noise(state, model, terms, assessment), beside,
-            adjusted_smooth_p=min(1.0, assessment.smooth_p * tried * len(names)),
         )
         for (model, tried, terms, assessment), p, null_p in zip(found, adjusted, null, strict=True)
     ]  # fmt: skip

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 
 from magtensor.components import Component
 from magtensor.errors import DataError
-from magtensor.loop.adopting import adopt, narrowed, polished
+from magtensor.loop.adopting import adopt, narrowed, on_those_that_show, polished
 from magtensor.loop.changing_matrix import channel_instead
 from magtensor.loop.contribution import agrees, eliminate, happens_once, of_all_alike, without_models
 from magtensor.loop.exchange import looked_at_again, simpler
@@ -114,7 +114,7 @@ def search(
         gone = (*([instead] if instead else []), *(() if NAME in dropped else dropped))
         steps[-1] = replace(steps[-1], adopted=source.evidence, dropped=gone)
         standing = trial(record, state, how)
-    last = _settled(record, state, how)
+    last = _settled(record, on_those_that_show(record, state, how, len(declared)), how)
     if shared is None or shared.objection == SINGLE_STRETCH:  # it may be flagged now
         shared = sought(last, record)
     found = Search(first, last, tuple(steps), _not_tested(last.excitation, models), failed, record, shared)

@@ -28,7 +28,7 @@ MOST_BEYOND = 0.25  # of the range that a calibration has seen of a channel
 
 
 def effect_variables(
-    adopted: Sequence[Adopted], theta: Sequence[Array], means: Mapping[str, Array], survey: Survey
+    adopted: Sequence[Adopted], theta: Sequence[Array], origins: Mapping[str, Array], survey: Survey
 ) -> dict[str, Variable]:
     """The effects found on a survey as a variable of the group `calibration`; nothing where there are none."""
     if not adopted:
@@ -46,14 +46,14 @@ def effect_variables(
         )
         for a, t in zip(adopted, theta, strict=True)
     ]
-    attributes = {"channel_means": json.dumps({k: np.asarray(v).tolist() for k, v in means.items()})}
+    attributes = {"channel_origins": json.dumps({k: np.asarray(v).tolist() for k, v in origins.items()})}
     attributes["start"] = started(survey).isoformat()
-    attributes["channel_ranges"] = json.dumps(_ranges(record_of(survey, means)))
+    attributes["channel_ranges"] = json.dumps(_ranges(record_of(survey, origins)))
     return {"calibration/effects": (("effect",), np.array(texts, dtype=np.str_), attributes)}
 
 
 def stored_effects(calibration: Survey, registry: Registry) -> tuple[list[Adopted], list[Array], dict[str, Array]]:
-    """Effects, coefficients and channel means of a calibration.
+    """Effects, coefficients and channel origins of a calibration.
 
     Raises:
         UsageError: an error model of the calibration is not installed.
@@ -70,14 +70,15 @@ def stored_effects(calibration: Survey, registry: Registry) -> tuple[list[Adopte
         component = registry.find("error_model", name)
         adopted.append(Adopted(component, facts["settings"], tuple(facts["sensors"])))
         theta.append(np.asarray(facts["theta"], dtype=float))
-    means = {k: np.asarray(v, dtype=float) for k, v in json.loads(variable.attrs["channel_means"]).items()}
-    return adopted, theta, means
+    known = variable.attrs.get("channel_origins") or variable.attrs["channel_means"]  # so called up to 2026
+    origins = {k: np.asarray(v, dtype=float) for k, v in json.loads(known).items()}
+    return adopted, theta, origins
 
 
 def on_its_clock(
     adopted: Sequence[Adopted],
     theta: Sequence[Array],
-    means: Mapping[str, Array],
+    origins: Mapping[str, Array],
     calibration: Survey,
     fitted: ArrayCalibration,
     survey: Survey,
@@ -94,7 +95,7 @@ def on_its_clock(
     dated = [i for i, a in enumerate(known) if a.start is not None and a.component.effect == "instrument"]
     if not dated:
         return known
-    record = record_of(survey, means=means, every=True)
+    record = record_of(survey, origins=origins, every=True)
     own = [i for i, a in enumerate(known) if a.component.effect == "instrument" and not _lacking(a, record)]
     own = [i for i in own if known[i].name != NAME]  # its waveform here is found when the others are taken off
     effects = [(known[i], theta[i]) for i in own]
@@ -112,14 +113,14 @@ def begun_anew(adopted: Sequence[Adopted], calibration: Survey) -> str:
 def recorded_alike(
     adopted: Sequence[Adopted],
     theta: Sequence[Array],
-    means: Mapping[str, Array],
+    origins: Mapping[str, Array],
     fitted: ArrayCalibration,
     survey: Survey,
 ) -> tuple[list[Adopted], list[Array], str]:
     """The effects that another survey has too, their coefficients, and the name of what its own lengths refute: rows
     that are averages belong to the way a survey was recorded. "" where nothing is refuted."""
     others = [i for i, a in enumerate(adopted) if a.name != AVERAGING]
-    record = record_of(survey, means=means, every=True) if len(others) < len(adopted) else None
+    record = record_of(survey, origins=origins, every=True) if len(others) < len(adopted) else None
     if record is None or any(a.component.effect != "site" and _lacking(a, record) for a in adopted):
         return list(adopted), list(theta), ""  # what it lacks is told when the effects are taken off
     if not averaged_otherwise(record, fitted, adopted, theta, survey.good):
@@ -158,7 +159,7 @@ def cleaned(
     calibration: ArrayCalibration,
     adopted: Sequence[Adopted],
     theta: Sequence[Array],
-    means: Mapping[str, Array],
+    origins: Mapping[str, Array],
 ) -> Survey:
     """The survey with the adopted effects taken off `b_raw` and `total_field`.
 
@@ -167,7 +168,7 @@ def cleaned(
     """
     if not adopted:
         return survey
-    record = record_of(survey, means=means, every=True)
+    record = record_of(survey, origins=origins, every=True)
     where = str(survey.attributes.get("source", ""))
     for effect in adopted:
         if effect.component.effect != "site" and (lacking := _lacking(effect, record)):
@@ -215,12 +216,12 @@ def _ranges(record: Record) -> dict[str, list[float]]:
     return {name: [float(v.min()), float(v.max())] for name, v in record.logged.items()}
 
 
-def extrapolated(survey: Survey, calibration: Survey, adopted: Sequence[Adopted], means: Mapping[str, Array]) -> str:
+def extrapolated(survey: Survey, calibration: Survey, adopted: Sequence[Adopted], origins: Mapping[str, Array]) -> str:
     """Which effects follow a channel beyond what the calibration has seen of it, and how far; "" where none does."""
     known = calibration["calibration/effects"].attrs.get("channel_ranges") if adopted else None
     if known is None or not survey.good.any():
         return ""
-    seen, record = json.loads(str(known)), record_of(survey, means, use=survey.good)
+    seen, record = json.loads(str(known)), record_of(survey, origins, use=survey.good)
     now, words = _ranges(record), []
     for effect in (a for a in adopted if a.component.effect != "site"):  # what belongs to a site is not taken off
         for channel in _followed(effect, record):

@@ -14,6 +14,7 @@ import numpy as np
 
 from magtensor.loop.assessment import assess
 from magtensor.loop.changing_matrix import changing_matrices
+from magtensor.loop.contribution import happens_once
 from magtensor.loop.flagged import beyond_the_reference, flagged_words, lasting
 from magtensor.loop.found import Search
 from magtensor.loop.gates import Candidate
@@ -33,9 +34,7 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
     excess = excess_rms(state)
     line = strongest_line(state, record)
     last = found.steps[-1].candidates if found.steps else ()
-    seen = [
-        c for c in last if c.passes or (max(c.adjusted_p, c.adjusted_smooth_p) < c.alpha and c.adjusted_null_p < ALPHA)
-    ]
+    seen = [c for c in last if c.passes or (c.adjusted_p < c.alpha and c.adjusted_null_p < ALPHA)]
     flagged = lasting(~state.fit.keep, beyond_the_reference(state, record))
     if flagged.any():  # while effects were sought, what lasts was believed
         seen = [c for c in seen if _still_significant(c, state)]
@@ -101,7 +100,7 @@ def _still_significant(candidate: Candidate, state: State) -> bool:
 
     terms = candidate.model.terms(state.excitation).at(state.residual.samples)
     white = Whitened.of(state.residual, state.colours.across, state.colours.along, state.terms)
-    now = assess(white, terms)
+    now = assess(white, terms, once=happens_once(candidate.model))
     return now.p * candidate.tried < candidate.alpha and now.null_p * candidate.tried < ALPHA
 
 

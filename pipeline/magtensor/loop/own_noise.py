@@ -1,0 +1,319 @@
+"""How unlikely terms are in noise whose spectrum is each sensor's own, whatever its law.
+
+The loop's working colours are one for all sensors, they are laws of frequency, and stationary in each of the residual's
+two parts. None of that holds where one sensor is worse than the others, or a base station wanders beside the site. What
+is asked here needs none of it: coefficients are linear in the noise of the outputs, so the power of each sensor's noise
+at each frequency, as measured, gives their covariance, the working colours being no more than weights (the sandwich of
+White 1980, over frequencies). Slow noise of a sensor shows across the plane and, turned with the platform, along the
+field; what it does in both is added up before it is squared.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magtensor.calibration.types import Array
+from magtensor.loop.columns import across_directions, along_the_field
+from magtensor.loop.residual import Residual
+from magtensor.loop.statistics import identifiable
+from magtensor.loop.terms import REFERENCE, Terms, joined
+
+LEAST = 64  # samples, of fewer the noise is taken for white
+OCTAVE = 4  # frequencies in the lowest one
+BAND = 8  # frequencies in the lowest band in which sensors are compared
+_SMOOTHING = 8  # rounds in which a course between the middles of octaves gets their levels
+_SCORING = 30  # rounds in which the levels of the sensors are found
+_INNER_RANK = 1e-6  # of the largest singular value
+_LEAST_REFERENCE = 0.1  # of the power along the field, which is not the sensors'
+
+
+@dataclass(frozen=True)
+class OwnNoise:
+    """The noise of a residual, for tests of terms beside those that are in already.
+
+    Attributes:
+        residual: of N samples.
+        given: terms that are in; None without any.
+    """
+
+    residual: Residual
+    given: Terms | None
+
+    def p_value(self, terms: Terms) -> float:
+        """Probability that noise explains as much as terms, at the residual's samples, do beside the given ones.
+
+        The levels of the noise are those of all that is left, what the terms explain included, and known from few
+        frequencies where they are slow. So what is explained is compared with what is not, as a share of as many values
+        as the mean of the levels is known from (Satterthwaite 1946): beta-distributed, like the squared multiple
+        correlation.
+        """
+        from scipy.special import betaincc
+
+        every = terms if self.given is None else joined([self.given, terms])
+        across, along = self._across_of(every), self._along_of(every)
+        size = every.count if across is None else across.into.shape[1]
+        score, normal, alone = np.zeros(size), np.zeros((size, size)), np.zeros(every.count)
+        if across is not None:
+            self._add_across(across, score, normal)
+        if along is not None:
+            score[: every.count] += along.rows.T @ self._values_along
+            normal[: every.count, : every.count] += along.rows.T @ along.rows
+            alone += along.alone
+        alone += np.diagonal(normal)[: every.count]
+        tested = np.arange(every.count - terms.count, every.count)
+        others = np.setdiff1d(np.arange(size), tested)
+        seen = np.zeros((len(tested), size))
+        seen[:, tested] = np.eye(len(tested))
+        seen[:, others] = -normal[np.ix_(tested, others)] @ _inverse(normal[np.ix_(others, others)])
+        seen = identifiable(seen @ normal @ seen.T, alone[tested]).T @ seen
+        rank = len(seen)
+        if not rank:
+            return 1.0
+        parts, counts = self._noise_of(across, along, seen, every.count)
+        inverse = np.linalg.pinv(parts.sum(axis=0), hermitian=True)
+        share = np.einsum("ij,bji->b", inverse, parts)
+        freedom = rank**2 / float(np.sum(share**2 / counts))
+        if freedom <= rank + 1.0:
+            return 1.0
+        found = seen @ score
+        explained = min(float(found @ inverse @ found) / freedom, 1.0)
+        return float(betaincc(rank / 2.0, (freedom - rank) / 2.0, explained))
+
+    def _across_of(self, terms: Terms) -> _Across | None:
+        """What terms do across, and what C and o can do."""
+        residual = self.residual
+        raw = terms.part_output != REFERENCE
+        if residual.across is None or not raw.any():
+            return None
+        size, own, count = len(residual.noise), residual.affine.shape[1], terms.series.shape[1]
+        outputs = terms.part_output[raw]
+        into = np.zeros((count + own, terms.count + own * size, size))
+        np.add.at(into, (terms.part_series[raw], terms.part_term[raw], outputs), 1.0 / residual.noise[outputs])
+        for a in range(own):
+            first = terms.count + a * size
+            into[count + a, first : first + size] = np.eye(size)
+        series = _frequencies(np.hstack([terms.series, residual.affine])) / self._root_across[:, None]
+        series[0] = 0.0
+        return _Across(series, into)
+
+    def _along_of(self, terms: Terms) -> _Along | None:
+        """The columns of terms along the field, whitened, what C and o can do taken off."""
+        residual, rows = self.residual, []
+        if residual.along is not None:
+            rows.append(_frequencies(along_the_field(residual, [terms]).made) / self._root_along[:, None])
+        if residual.sighted is not None:
+            rows.append(across_directions(residual, [terms]).made)
+        if not rows:
+            return None
+        columns, free = np.concatenate(rows), self._free_along
+        left = columns - free @ (free.T @ columns)
+        return _Along(left, np.sum(columns**2, axis=0) - np.sum(left**2, axis=0))
+
+    def _add_across(self, across: _Across, score: Array, normal: Array) -> None:
+        """Add what the values across say of the coefficients, weighted by the noise of each sensor in each band."""
+        values = self._across / self._root_across[:, None]
+        for (i, j), weight in zip(pairwise(self._edges), self._weights, strict=True):
+            weighted, series = across.into @ weight, across.series[i:j]
+            score += np.einsum("sko,so->k", weighted, series.T @ values[i:j])
+            normal += np.einsum("sko,st,tlo->kl", weighted, series.T @ series, across.into, optimize=True)
+
+    def _noise_of(self, across: _Across | None, along: _Along | None, seen: Array, count: int) -> tuple[Array, Array]:
+        """(B, R, R) covariance of scores from each part of the noise, and (B,) how many values tell its level.
+
+        Parameters
+        ----------
+        seen: (R, P or more) the scores, as sums of those of the terms, of which the first are `count`.
+        """
+        residual, edges = self.residual, self._edges
+        n, sensors, each = len(residual.affine), len(residual.noise) // 3, np.diff(edges).astype(float)
+        parts, counts, turned = [], [], None
+        rows = None if along is None else along.rows @ seen[:, :count].T
+        if rows is not None and residual.along is not None:
+            turned = _course(rows[:n] / self._root_along[:, None])
+            parts.append(_grams(rows[:n] * np.sqrt(self._reference / self._root_along**2)[:, None], edges))
+            counts.append(each)
+        if rows is not None and residual.sighted is not None:
+            sighted = rows[-len(residual.sighted.residual) :]
+            parts.append((sighted.T @ sighted)[None])
+            counts.append(np.array([2.0 * n]))
+        if residual.across is not None:
+            of_output = np.zeros((3 * sensors, n, len(seen)))
+            if turned is not None:
+                for o, gain in enumerate(residual.gain.T):
+                    of_output[o] += _frequencies(turned * gain[:, None]) * self._root_across[:, None]
+            if across is not None:
+                for (i, j), weight in zip(pairwise(edges), self._weights, strict=True):
+                    through = np.einsum("rk,sko->osr", seen, across.into @ weight, optimize=True)
+                    of_output[:, i:j] += across.series[i:j] @ through
+            for sensor, levels in enumerate(self._levels.T):
+                found = sum(_grams(of_output[o], edges) for o in range(3 * sensor, 3 * sensor + 3))
+                parts.append(found * levels[:, None, None])
+                counts.append(each * 3.0 * (sensors - 1) / sensors)
+        return np.concatenate(parts), np.concatenate(counts)
+
+    @cached_property
+    def _edges(self) -> NDArray[np.int_]:
+        """(B + 1,) frequencies between which the noise of the sensors is compared."""
+        n = len(self.residual.affine)
+        octaves = BAND * 2 ** np.arange(max(int(np.log2(n)), 1))
+        return np.concatenate([[0], octaves[octaves < n // 2], [n]])
+
+    @cached_property
+    def _across(self) -> Array:
+        """(N, 3 S) the residual across, over frequency, without its mean."""
+        assert self.residual.across is not None
+        out = _frequencies(self.residual.across)
+        out[0] = 0.0
+        return out
+
+    @cached_property
+    def _root_across(self) -> Array:
+        """(N,) root of its mean power, smoothed."""
+        values = len(self.residual.noise) - 3
+        return np.sqrt(smoothed_spectrum(np.sum(self._across**2, axis=1) / values))
+
+    @cached_property
+    def _levels(self) -> Array:
+        """(B, S) power of each sensor's noise over that of all, in each band."""
+        white = self._across / self._root_across[:, None]
+        return np.stack([_levels(white[i:j], self.residual.projector) for i, j in pairwise(self._edges)])
+
+    @cached_property
+    def _weights(self) -> Array:
+        """(B, 3 S, 3 S) inverse covariance across of the sensors' noise in each band."""
+        projector = self.residual.projector
+        each = [_inverse(projector * np.repeat(levels, 3) @ projector, 1e-9) for levels in self._levels]
+        return np.stack(each)
+
+    @cached_property
+    def _along(self) -> Array:
+        """(N,) the residual along, over frequency."""
+        assert self.residual.along is not None
+        return _frequencies(self.residual.along)
+
+    @cached_property
+    def _root_along(self) -> Array:
+        """(N,) root of its power, smoothed."""
+        return np.sqrt(smoothed_spectrum(self._along**2))
+
+    @cached_property
+    def _values_along(self) -> Array:
+        """(N,), or 2 N more of known directions: what the columns along are compared with."""
+        residual, values = self.residual, []
+        if residual.along is not None:
+            values.append(self._along / self._root_along)
+        if residual.sighted is not None:
+            values.append(residual.sighted.residual)
+        return np.concatenate(values)
+
+    @cached_property
+    def _free_along(self) -> Array:
+        """(N or more, Q) orthonormal: what C and o can explain of these."""
+        residual, rows = self.residual, []
+        if residual.along is not None:
+            rows.append(_frequencies(residual.inner) / self._root_along[:, None])
+        if residual.sighted is not None:
+            rows.append(residual.sighted.inner)
+        basis, size, _ = np.linalg.svd(np.concatenate(rows), full_matrices=False)
+        out: Array = basis[:, size > _INNER_RANK * size[0]]
+        return out
+
+    @cached_property
+    def _reference(self) -> Array:
+        """(N,) power along the field that is not the sensors': all of it, but for the white noise of these."""
+        power = self._root_along**2
+        if self.residual.across is None:
+            return power
+        shown = np.mean(self.residual.gain**2, axis=0).reshape(-1, 3).sum(axis=1)
+        white = float(shown @ self._levels[-1]) * float(self._root_across[-1] ** 2)
+        return np.maximum(power - white, _LEAST_REFERENCE * power)
+
+
+@dataclass(frozen=True)
+class _Across:
+    """Whitened series (N, K) over frequency, which P coefficients put into the outputs by (K, P, 3 S)."""
+
+    series: Array
+    into: Array
+
+
+@dataclass(frozen=True)
+class _Along:
+    """Whitened columns (N or more, P), and what of the square of each C and o could do (P,)."""
+
+    rows: Array
+    alone: Array
+
+
+def smoothed_spectrum(power: Array) -> Array:
+    """Power (N,) over the cosine frequencies, smoothed over octaves; below the middle of the lowest it rises as it does
+    above."""
+    n = len(power)
+    if n < LEAST:
+        return np.full(n, max(float(np.mean(power[1:])), 1e-300))
+    octaves = OCTAVE * 2 ** np.arange(int(np.log2(n)))
+    edges = np.concatenate([[1], octaves[octaves < n // 2], [n]])
+    place = np.log(np.arange(1, n))
+
+    def means(values: Array) -> Array:
+        return np.add.reduceat(values, edges[:-1] - 1) / np.diff(edges)
+
+    level, middle = means(np.maximum(power[1:], 1e-300)), means(place)
+
+    def between(course: Array) -> Array:
+        values = np.interp(place, middle, course)
+        slope = min((course[1] - course[0]) / (middle[1] - middle[0]), 0.0)
+        return np.exp(values + slope * np.minimum(place - middle[0], 0.0))
+
+    course = np.log(level)
+    for _ in range(_SMOOTHING):
+        course += np.log(level / means(between(course)))
+    smooth = between(course)
+    return np.concatenate([smooth[:1], smooth])
+
+
+def _levels(white: Array, projector: Array) -> Array:
+    """(S,) the likeliest power of each sensor's noise in whitened values across (K, 3 S).
+
+    Two sensors have one contrast, which does not tell whose noise it is. Steps of scoring on the logarithms, halved:
+    they keep the levels positive and raise the likelihood.
+    """
+    sensors = len(projector) // 3
+    covariance = white.T @ white / len(white)
+    if sensors < 3:
+        return np.full(sensors, float(np.trace(covariance)) / (3 * sensors - 3))
+    levels: Array = np.ones(sensors)
+    for _ in range(_SCORING):
+        inverse = _inverse(projector * np.repeat(levels, 3) @ projector, 1e-9)
+        seen = np.diagonal(inverse @ covariance @ inverse).reshape(sensors, 3).sum(axis=1)
+        expected = np.diagonal(inverse).reshape(sensors, 3).sum(axis=1)
+        levels = np.asarray(levels * np.sqrt(np.maximum(seen, 1e-12 * expected) / expected))
+    return levels
+
+
+def _frequencies(series: Array) -> Array:
+    from scipy.fft import dct
+
+    out: Array = dct(series, axis=0, norm="ortho")
+    return out
+
+
+def _course(spectrum: Array) -> Array:
+    from scipy.fft import idct
+
+    out: Array = idct(spectrum, axis=0, norm="ortho")
+    return out
+
+
+def _inverse(matrix: Array, least: float = 1e-10) -> Array:
+    return np.asarray(np.linalg.pinv(matrix, rcond=least, hermitian=True), dtype=float)
+
+
+def _grams(columns: Array, edges: NDArray[np.int_]) -> Array:
+    """(B, P, P) products of the columns of (N, P) in each band."""
+    return np.stack([columns[i:j].T @ columns[i:j] for i, j in pairwise(edges)])

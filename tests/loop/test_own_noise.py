@@ -1,0 +1,161 @@
+"""Terms tested in noise of each sensor's own spectrum: the p value is one, whoever is noisy and by whatever law."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from loop_cases import Array, linear_state, synthetic
+from scipy.signal import lfilter
+
+from magtensor.loop.assessment import block_count
+from magtensor.loop.colour import colour_of
+from magtensor.loop.evidence import grams
+from magtensor.loop.gates import ALPHA, Candidate
+from magtensor.loop.model import State
+from magtensor.loop.own_noise import OwnNoise, smoothed_spectrum
+from magtensor.loop.screening import candidates_of
+from magtensor.loop.search import with_lines
+from magtensor.loop.statistics import family_p
+from magtensor.registry import Registry
+
+SAMPLES = 1500
+
+
+def wandering(rng: np.random.Generator, tau: float, lags: int = 1, samples: int = SAMPLES) -> Array:
+    """A stationary series (N, 3) of unit rms through first-order lags of a time constant in samples."""
+    course, keep = rng.standard_normal((samples + round(20 * tau), 3)), np.exp(-1.0 / tau)
+    for _ in range(lags):
+        course = lfilter([1.0 - keep], [1.0, -keep], course, axis=0)
+    course = course[-samples:]
+    out: Array = course / course.std()
+    return out
+
+
+def noisy(seed: int, noise: dict[int, tuple[float, float]], tau: float, lags: int = 1) -> Array:
+    """(N, 4, 3) slow noise of some sensors: rms in nT by the sensor's number."""
+    rng = np.random.default_rng(seed)
+    added = np.zeros((SAMPLES, 4, 3))
+    for sensor, rms in noise.items():
+        added[:, sensor] = rms * wandering(rng, tau, lags)
+    return added
+
+
+NOISES = {
+    "white": ({}, 10.0, 1),
+    "one sensor": ({2: 1.0}, 60.0, 1),
+    "one sensor, smooth": ({2: 1.0}, 30.0, 2),
+    "two sensors": ({0: 0.3, 2: 1.0}, 200.0, 1),
+    "all sensors": ({0: 1.0, 1: 1.0, 2: 1.0, 3: 1.0}, 60.0, 1),
+}
+
+
+@pytest.mark.parametrize("which", NOISES)
+def test_the_p_value_is_one(which: str) -> None:
+    """Offsets for a while at places that nobody sought: of 120 the p values are as even as chance has them."""
+    offset_while = Registry.load().find("error_model", "offset_while")
+    found = []
+    for seed in range(6):
+        added = noisy(100 + seed, *NOISES[which])  # type: ignore[arg-type]
+        state = linear_state(synthetic(200 + seed, SAMPLES, turning_s=4.0, noise_nT=0.3, added=added))
+        noise = OwnNoise(state.residual, None)
+        for begin in range(60, 1260, 60):
+            terms = offset_while.function(state.excitation, time_s=begin + 0.5, until_s=begin + 120.5)
+            found.append(noise.p_value(terms.at(state.residual.samples)))
+    p = np.array(found)
+    assert 0.35 < p.mean() < 0.75
+    assert np.mean(p < 0.1) < 0.2  # of neighbours that overlap some 60 are independent
+    assert p.min() > 1e-4
+
+
+def test_slow_noise_of_one_sensor_is_no_offset_for_a_while() -> None:
+    """The scatter over blocks is no guard against it: what happens once lies in two or three of these."""
+    offset_while = Registry.load().find("error_model", "offset_while")
+    by_blocks = 0
+    for seed in range(3):
+        record = synthetic(seed, SAMPLES, turning_s=4.0, noise_nT=0.15, added=noisy(seed, {2: 0.4}, 200.0))
+        state = with_lines(linear_state(record), record)
+        (found,) = candidates_of(state, [offset_while], {}, ALPHA)
+        by_blocks += scatter_over_blocks(state, found) * found.tried < ALPHA
+        assert found.adjusted_p > ALPHA and not found.passes
+    assert by_blocks
+
+
+def scatter_over_blocks(state: State, found: Candidate) -> float:
+    colours, count = found.assessment.colours, block_count(SAMPLES)
+    blocks = grams(state.residual, found.terms, colours.across, colours.along, count)
+    return family_p(blocks, found.terms.sensors, list(range(found.terms.count)))
+
+
+def test_a_quiet_sensor_beside_it_is_judged_by_its_own_noise() -> None:
+    """An offset of 0.3 nT for a fifth of the time stands out in the quiet sensor, not in the noisy one."""
+    offset_while = Registry.load().find("error_model", "offset_while")
+    p = {}
+    for sensor in (0, 2):
+        added = noisy(4, {2: 1.0}, 60.0)
+        added[600:900, sensor] += [0.3, -0.3, 0.3]
+        state = linear_state(synthetic(4, SAMPLES, turning_s=4.0, noise_nT=0.15, added=added))
+        terms = offset_while.function(state.excitation, time_s=599.5, until_s=899.5).at(state.residual.samples)
+        p[sensor] = OwnNoise(state.residual, None).p_value(terms.only(range(3 * sensor, 3 * sensor + 3)))
+    assert p[0] < 1e-6 and p[2] > 1e-3
+
+
+def test_what_is_in_already_is_free() -> None:
+    """Beside itself nothing is left of a term, and beside another it is what it is beside that one."""
+    step = Registry.load().find("error_model", "offset_step")
+    added = np.zeros((SAMPLES, 4, 3))
+    added[700:, 1] = 1.0
+    state = linear_state(synthetic(6, SAMPLES, turning_s=4.0, noise_nT=0.3, added=added))
+    terms, other = (step.function(state.excitation, time_s=at).at(state.residual.samples) for at in (699.5, 300.5))
+    assert OwnNoise(state.residual, None).p_value(terms) < 1e-10
+    assert OwnNoise(state.residual, terms).p_value(terms) == 1.0
+    assert OwnNoise(state.residual, other).p_value(terms) < 1e-10
+    assert OwnNoise(state.residual, terms).p_value(other) > 1e-3
+
+
+def test_two_sensors_and_no_reference() -> None:
+    """What one of two sensors does and a total field that is not known: the contrast alone."""
+    added = np.zeros((SAMPLES, 2, 3))
+    added[700:, 1] = 0.3
+    record = synthetic(7, SAMPLES, sensors=2, turning_s=4.0, noise_nT=0.3, added=added)
+    state = linear_state(record)
+    step = Registry.load().find("error_model", "offset_step")
+    there, elsewhere = (step.function(state.excitation, time_s=at).at(state.residual.samples) for at in (699.5, 200.5))
+    for residual in (state.residual, replace(state.residual, along=None), replace(state.residual, across=None)):
+        assert OwnNoise(residual, None).p_value(there) < 1e-4 < OwnNoise(residual, None).p_value(elsewhere)
+
+
+def test_the_smoothed_spectrum_is_that_of_noise_which_no_law_describes() -> None:
+    """White after it in every octave, where the fitted law is off by more than a factor of two."""
+    rng = np.random.default_rng(1)
+    series = np.column_stack([wandering(rng, 60.0, 2, 3000) for _ in range(14)])
+    series += 0.02 * rng.standard_normal(series.shape)
+    power = frequencies(series) ** 2
+    edges = [1, 2, 4, *(8 * 2**k for k in range(9))]
+
+    def octaves(ratio: Array) -> Array:
+        return np.array([np.mean(ratio[a:b]) for a, b in itertools.pairwise(edges)])
+
+    smoothed = octaves(power.mean(axis=1) / smoothed_spectrum(power.mean(axis=1)))
+    np.testing.assert_allclose(smoothed[2:], 1.0, atol=0.2)
+    assert np.all(smoothed[:2] < 1.6)  # of the first three frequencies only a line through them is known
+    law = colour_of(series, stiff=True)
+    assert law.power is not None
+    by_law = octaves(power.mean(axis=1) / (law.white * law.power))
+    assert max(by_law.max(), 1.0 / by_law.min()) > 2.0
+
+
+def test_below_its_lowest_octave_a_steep_spectrum_goes_on_to_rise() -> None:
+    """Of 1/f^2 the mean of the first three frequencies is a half of the first."""
+    found = smoothed_spectrum(1.0 / np.maximum(np.arange(4000.0), 0.5) ** 2)
+    np.testing.assert_allclose(found[1:8] * np.arange(1, 8) ** 2, 1.0, atol=0.35)
+
+
+def frequencies(series: Array) -> Array:
+    """By the definition of the cosine transform."""
+    n = len(series)
+    cosines = np.cos(np.pi * np.outer(np.arange(n), np.arange(n) + 0.5) / n) * np.sqrt(2.0 / n)
+    out: Array = cosines @ series
+    return out
