@@ -176,10 +176,9 @@ def apply_and_refine(
         begun_anew,
         cleaned,
         extrapolated,
-        left_in,
         on_its_clock,
-        recorded_alike,
         stored_effects,
+        those_here,
     )  # fmt: skip
     from magtensor.offsets_apart import scatter_for, without_scatter
     from magtensor.platform_frame import as_fitted, with_refined_rotation
@@ -199,16 +198,17 @@ def apply_and_refine(
         fitted = with_scatter(fitted, apart)
         adopted, theta, origins = stored_effects(calibration, planned.registry)
         adopted = on_its_clock(adopted, theta, origins, calibration, as_fitted(calibration, fitted), survey)
-        adopted, theta, refuted = recorded_alike(adopted, theta, origins, as_fitted(calibration, fitted), survey)
+        here = those_here(adopted, theta, origins, as_fitted(calibration, fitted), survey)
+        adopted, theta = here.adopted, here.theta
         before, survey = survey, cleaned(survey, as_fitted(calibration, fitted), adopted, theta, origins)
         if judge:
             known = calibration.values("calibration/noise_std") if "calibration/noise_std" in calibration else None
             survey = flagged(survey, fitted, known, uniform=uniform)
         words = {
-            "not_taken_off": left_in(survey, adopted),
+            "not_taken_off": here.left_in,
             "extrapolated": extrapolated(before, calibration, adopted, origins),
             "begins_anew": begun_anew(adopted, calibration),
-            "not_on_this_survey": refuted,
+            "not_on_this_survey": here.refuted,
         }
         survey = survey.merged(_named(corrected(fitted, survey, **words), calibration, dated, apart))
         if refine_rotation:

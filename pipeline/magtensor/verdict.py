@@ -120,9 +120,15 @@ def _disagreement(outcome: dict[str, Any]) -> str:
     known = [v is not None for v in (before.get("all"), after.get("all"), here.get("all"))]
     if not all(known):
         return ""
-    if after["all"] > WORSE * before["all"]:
+    worse, apart = after["all"] > WORSE * before["all"], after["all"] > DISAGREES * here["all"]
+    if (worse or apart) and any(a.get("kind") == "site" for a in outcome["adopted"]):
+        return (
+            "; the field of the site was modelled, not taken off: if the verification survey was made there too, it is "
+            "in it and in its errors"
+        )
+    if worse:
         return "; what was added makes the verification survey worse: it does not carry over"
-    if after["all"] > DISAGREES * here["all"]:
+    if apart:
         return "; the verification survey disagrees with the calibration: look for what changed between the two"
     return ""
 

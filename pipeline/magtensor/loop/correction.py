@@ -14,7 +14,7 @@ from magtensor.loop.another_survey import as_begun_here
 from magtensor.loop.delays import cleared, lateness, on_time, unseen
 from magtensor.loop.model import Adopted, Record, State, without
 from magtensor.loop.terms import Terms
-from magtensor.loop.waveform import NAME, course_of
+from magtensor.loop.waveform import NAME, bends, course_of
 from magtensor.tensor.geometry import array_design
 
 MOST_STEPS = 8
@@ -102,16 +102,41 @@ def hidden_waveform(
     raw: (N, S, 3) nT, other effects taken off.
     theta: (3 S,) nT, what a unit of the waveform adds to the outputs; noise: (3 S,) nT of these.
     """
-    usable: NDArray[np.bool_] = np.asarray(np.isfinite(raw).all(axis=(1, 2)))
-    if good is not None:
-        usable = usable & good
+    usable = _usable(raw, good)
     if position is None or not usable.any():
         return np.zeros(len(raw))
+    return course_of(*_beside_a_field(raw, calibration, position, noise), theta / noise, usable).values
+
+
+def _usable(raw: Array, good: NDArray[np.bool_] | None) -> NDArray[np.bool_]:
+    whole: NDArray[np.bool_] = np.asarray(np.isfinite(raw).all(axis=(1, 2)))
+    return whole if good is None else whole & good
+
+
+def _beside_a_field(raw: Array, calibration: ArrayCalibration, position: Array, noise: Array) -> tuple[Array, Array]:
+    """Whitened outputs (N, 3 S), and the directions (3 S, k) in which a uniform field and a gradient move them."""
     forward = np.linalg.inv(calibration.matrix)
     field = array_design(position, "gradient").reshape(len(forward), 3, -1)
     held = np.einsum("sij,sjk->sik", forward, field).reshape(len(noise), -1) / noise[:, None]
-    whitened = (np.nan_to_num(raw) - calibration.offset).reshape(len(raw), -1) / noise
-    return course_of(whitened, held, theta / noise, usable).values
+    return (np.nan_to_num(raw) - calibration.offset).reshape(len(raw), -1) / noise, held
+
+
+def hidden_in_a_bent_field(
+    record: Record,
+    calibration: ArrayCalibration,
+    adopted: Sequence[Adopted],
+    theta: Sequence[Array],
+    good: NDArray[np.bool_] | None = None,
+) -> bool:
+    """Whether a field that bends within the array would pass for the source that nobody logged on a survey."""
+    hidden = _hidden(adopted)
+    if hidden is None or record.position is None:
+        return False
+    others = [i for i in range(len(adopted)) if i != hidden]
+    raw = corrected_raw(record, calibration, [adopted[i] for i in others], [theta[i] for i in others], good)
+    noise, usable = _weights(adopted[hidden], raw[0].size), _usable(raw, good)
+    whitened, held = _beside_a_field(raw, calibration, record.position, noise)
+    return bends(whitened[usable], held, theta[hidden] / noise)
 
 
 def as_elsewhere(record: Record, calibration: ArrayCalibration, state: State) -> Record:

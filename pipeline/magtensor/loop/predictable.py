@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import numpy as np
 
+from magtensor.calibration.types import Array
 from magtensor.loop.assessment import WHITE, Colours, block_count
 from magtensor.loop.direction import attitude_series, direction_series
-from magtensor.loop.excitation import Excitation
+from magtensor.loop.excitation import AXES, Excitation
 from magtensor.loop.model import State
-from magtensor.loop.statistics import Gain, held_out_gain
+from magtensor.loop.statistics import FOLDS, Gain, held_out_gain
 from magtensor.loop.terms import Terms, joined
 
 LEAST_T = 4.5  # one in a thousand by chance: paired t over folds of what the direction predicts
+LEAST_T_OF_EACH = 6.5  # the same for each of a dozen outputs
+LEAST_IN_CLASS = 20  # samples that read much the same
+LEAST_CLASSES, MOST_CLASSES = 16, 64
 MOSTLY = 0.9  # of what outputs of their own explain: if the total field alone does that, it is the total field
 LEAST_FOR_DIRECTION = 60  # samples for each output, at least, before its own polynomial can be asked for
 
@@ -53,6 +57,54 @@ def predictable_in_the_total_field(state: State) -> float:
         return 0.0
     each = [state.excitation.on_reference(column, "nT", str(number)) for number, column in enumerate(series.T)]
     return _predictable(state, joined(each))
+
+
+def converter_words(state: State) -> list[str]:
+    """Which outputs depart by an amount that follows from what they read, as those of a converter that is not linear
+    do: steps and waves that no polynomial is."""
+    residual, x = state.residual, state.excitation
+    if residual.across is None:
+        return []
+    found: dict[str, list[str]] = {}
+    amounts = []
+    for number, column in enumerate(residual.across.T):
+        sensor, axis = divmod(number, 3)
+        amount = _of_what_it_reads(x.output[residual.samples, sensor, axis], column)
+        if amount > 0:
+            found.setdefault(x.sensors[sensor], []).append(AXES[axis])
+            amounts.append(amount * residual.noise[number])
+    if not found:
+        return []
+    names = ", ".join(f"{sensor} ({' '.join(axes)})" for sensor, axes in found.items())
+    return [
+        f"what {names} add follows from what they read, by {max(amounts):.2g} nT rms at most, predicted on held-out "
+        "blocks: a converter that is not linear"
+    ]
+
+
+def _of_what_it_reads(readings: Array, values: Array) -> float:
+    """The rms of values (N,) that the mean of those with readings (N,) nearby predicts on contiguous blocks; 0 if none.
+
+    The mean of every class of readings is shrunk towards zero by as much as its own noise asks for.
+    """
+    count = min(len(readings) // LEAST_IN_CLASS, MOST_CLASSES)
+    if count < LEAST_CLASSES or not np.ptp(readings) > 0:
+        return 0.0
+    number = ((readings - readings.min()) / np.ptp(readings) * count).astype(int).clip(0, count - 1)
+    fold = np.arange(len(values)) * FOLDS // len(values)
+    before, after = np.zeros(FOLDS), np.zeros(FOLDS)
+    for k in range(FOLDS):
+        test = fold == k
+        size = np.bincount(number[~test], minlength=count)
+        total = np.bincount(number[~test], values[~test], minlength=count)
+        mean = total / np.maximum(size, 1)
+        spread = float(np.var(values[~test]))
+        own = max(float(np.average(mean**2, weights=size)) - spread * count / max(size.sum(), 1), 0.0)
+        mean *= own * size / np.maximum(own * size + spread, 1e-300)
+        before[k] = np.sum(values[test] ** 2)
+        after[k] = np.sum((values[test] - mean[number[test]]) ** 2)
+    gain = Gain(before, after, np.bincount(fold, minlength=FOLDS).astype(float))
+    return float(np.sqrt(max(gain.total, 0.0) / len(values))) if gain.t > LEAST_T_OF_EACH else 0.0
 
 
 def shortened_words(state: State) -> list[str]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from datetime import datetime, timedelta
 from typing import Any
 
@@ -13,7 +13,7 @@ import numpy as np
 from magtensor.calibration.types import Array, ArrayCalibration
 from magtensor.errors import DataError, UsageError
 from magtensor.loop.another_survey import TONE, begins_anew, shows_a_state
-from magtensor.loop.correction import corrected_raw, corrected_reference
+from magtensor.loop.correction import corrected_raw, corrected_reference, hidden_in_a_bent_field
 from magtensor.loop.lengths import AVERAGING, averaged_otherwise
 from magtensor.loop.model import Adopted, Record
 from magtensor.loop.needs import FACTS
@@ -110,22 +110,49 @@ def begun_anew(adopted: Sequence[Adopted], calibration: Survey) -> str:
     return ", ".join(dict.fromkeys(a.name for a in adopted if _of_a_time(a) and a.start is None))
 
 
-def recorded_alike(
+@dataclass(frozen=True)
+class Here:
+    """The effects of a calibration that another survey lets be taken off, with their coefficients.
+
+    Attributes:
+        refuted: the name of what its own lengths refute; "" where nothing is.
+        left_in: what it may have and does not let be taken off, and why; "" where there is nothing.
+    """
+
+    adopted: list[Adopted]
+    theta: list[Array]
+    refuted: str
+    left_in: str
+
+
+def those_here(
     adopted: Sequence[Adopted],
     theta: Sequence[Array],
     origins: Mapping[str, Array],
     fitted: ArrayCalibration,
     survey: Survey,
-) -> tuple[list[Adopted], list[Array], str]:
-    """The effects that another survey has too, their coefficients, and the name of what its own lengths refute: rows
-    that are averages belong to the way a survey was recorded. "" where nothing is refuted."""
-    others = [i for i, a in enumerate(adopted) if a.name != AVERAGING]
-    record = record_of(survey, origins=origins, every=True) if len(others) < len(adopted) else None
+) -> Here:
+    """The effects that another survey has too.
+
+    Rows that are averages belong to the way a survey was recorded, which its lengths may refute. A source that nobody
+    logged cannot be told from a field that bends within the array.
+    """
+    here = Here(list(adopted), list(theta), "", left_in(survey, adopted))
+    asked = {AVERAGING, NAME} & {a.name for a in adopted}
+    record = record_of(survey, origins=origins, every=True) if asked else None
     if record is None or any(a.component.effect != "site" and _lacking(a, record) for a in adopted):
-        return list(adopted), list(theta), ""  # what it lacks is told when the effects are taken off
-    if not averaged_otherwise(record, fitted, adopted, theta, survey.good):
-        return list(adopted), list(theta), ""
-    return [adopted[i] for i in others], [theta[i] for i in others], AVERAGING
+        return here  # what it lacks is told when the effects are taken off
+    if AVERAGING in asked and averaged_otherwise(record, fitted, adopted, theta, survey.good):
+        here = _without(here, AVERAGING, refuted=AVERAGING)
+    if NAME in asked and hidden_in_a_bent_field(record, fitted, here.adopted, here.theta, survey.good):
+        words = f"{NAME}: the field bends within the array, by more than it may be told from"
+        here = _without(here, NAME, left_in="; ".join(w for w in (here.left_in, words) if w))
+    return here
+
+
+def _without(here: Here, name: str, **words: str) -> Here:
+    kept = [i for i, a in enumerate(here.adopted) if a.name != name]
+    return replace(here, adopted=[here.adopted[i] for i in kept], theta=[here.theta[i] for i in kept], **words)
 
 
 def begun_with(adopted: Sequence[Adopted], begun: datetime, survey: Survey) -> list[Adopted]:

@@ -21,10 +21,14 @@ from magtensor.loop.gates import Candidate
 from magtensor.loop.gradient_shape import MODEL, gradient_share
 from magtensor.loop.latent import shared_words
 from magtensor.loop.model import Record, State
-from magtensor.loop.predictable import attitude_words, shortened_words
+from magtensor.loop.predictable import attitude_words, converter_words, shortened_words
 from magtensor.loop.spectrum import spectral_lines
+from magtensor.loop.stretches import ABOUT
 
 ALPHA = 0.001  # of each of the tests
+MUCH = 3.0  # times the white noise of an output: no base station beside a site differs by so much unnoticed
+LOUD = 2.0  # times the usual noise
+LEAST_LOUD = 50  # samples
 NOISE = "what is left is noise: white, and slow noise of each sensor alone or of the reference"
 
 
@@ -44,9 +48,15 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
         words.append(shared_words(found.shared, record.sensors))
     if line is not None:
         words.append(f"a line at {line[0]:.4g} Hz (period {1 / line[0]:.4g} s), {line[1]:.3g} nT rms")
-    words.extend(attitude_words(state))
+    following = attitude_words(state)
+    words.extend(following or converter_words(state))
     words.extend(shortened_words(state))
     words.extend(one.words for one in changing_matrices(state, ALPHA))
+    if (slow := slow_along(state)) > MUCH * state.residual.scale:
+        words.append(
+            f"{slow:.3g} nT rms of |b| - F, in all sensors alike, is no white noise: an error of the base station, or "
+            "a field at the site that it does not see"
+        )
     gradient = gradient_share(state, record.position)
     if open_ := [c.model.name for c in suspects if c.passes]:
         words.append(f"significant, passes the first two gates of the loop and is not adopted: {', '.join(open_)}")
@@ -65,16 +75,17 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
     if flagged.any():
         words.append(flagged_words(flagged, state, record))
     present = bool(words)
+    loud = loud_words(state, record)
     untested = [MODEL] if shaped and MODEL in found.not_tested else []
     return {
         "present": present,
         "excess_rms_nT": excess,
-        "description": "; ".join(words) if present else noise_words(state),
+        "description": "; ".join([*(words if present else noise_words(state)), *loud]),
         "looks_like": untested + _looks_like(last) if present else [],
     }
 
 
-def noise_words(state: State) -> str:
+def noise_words(state: State) -> list[str]:
     """What is left where nothing is unexplained, and what of it is not white where that is more than what is."""
     residual, white, words = state.residual, state.residual.scale, [NOISE]
     if residual.across is not None:
@@ -82,11 +93,38 @@ def noise_words(state: State) -> str:
         slow = white * max(float(np.sum(residual.across**2)) / values - 1.0, 0.0) ** 0.5
         if slow > white:
             words.append(f"{slow:.3g} nT rms is not white, mostly on {_sensors(state)}")
-    if residual.along is not None:
-        slow = max(float(np.mean((residual.along**2 - 1.0) / residual.reference_gain**2)), 0.0) ** 0.5
-        if slow > white:
-            words.append(f"{slow:.3g} nT rms of |b| - F is not white")
-    return "; ".join(words)
+    if (slow := slow_along(state)) > white:
+        words.append(f"{slow:.3g} nT rms of |b| - F is not white")
+    return words
+
+
+def slow_along(state: State) -> float:
+    """nT rms of |b| - F beyond white noise; 0 without a total field."""
+    residual = state.residual
+    if residual.along is None:
+        return 0.0
+    return max(float(np.mean((residual.along**2 - 1.0) / residual.reference_gain**2)), 0.0) ** 0.5
+
+
+def loud_words(state: State, record: Record) -> list[str]:
+    """Where the noise of a sensor is louder for a while: no effect, but worth a look."""
+    from scipy.ndimage import median_filter
+
+    residual = state.residual
+    if residual.across is None or len(residual.across) < 4 * LEAST_LOUD:
+        return []
+    words = []
+    for number, name in enumerate(state.excitation.sensors):
+        own = residual.across[:, 3 * number : 3 * number + 3]
+        rough = median_filter(np.sum(np.diff(own, axis=0) ** 2, axis=1), size=ABOUT, mode="mirror")
+        usual = float(np.median(rough))
+        loud = rough > LOUD**2 * usual
+        edges = np.flatnonzero(np.diff(loud.astype(int), prepend=0, append=0)).reshape(-1, 2)
+        for first, end in edges[np.diff(edges, axis=1)[:, 0] >= LEAST_LOUD]:
+            begin, until = (record.time[residual.samples[i]] - record.start for i in (first, end))
+            times = float(np.sqrt(np.median(rough[first:end]) / usual))
+            words.append(f"from {begin:.5g} to {until:.5g} s the noise of {name} is {times:.2g} times as loud as usual")
+    return words
 
 
 def excess_rms(state: State) -> float:

@@ -23,6 +23,7 @@ LEAST_SHARE = 0.02  # of the vector's square that must lie in free directions: l
 # unless two levels tell each sample's state
 LEAST_IN_BAND = 12  # cosine coefficients from which a level of the spectrum is taken
 BANDS = 40
+BENDING = 10.0
 
 
 @dataclass(frozen=True)
@@ -69,6 +70,28 @@ def course_of(whitened: Array, held: Array, direction: Array, good: NDArray[np.b
     if information < LEAST_SHARE * float(direction @ direction) and not course.switches:
         return Course(np.zeros(n), 0.0, 0.0, 0.0)
     return replace(course, values=np.interp(np.arange(n), used, course.values))
+
+
+def bends(whitened: Array, held: Array, direction: Array) -> bool:
+    """Whether a field that bends within the array shows more where a source is looked for than the source may.
+
+    What is neither uniform nor a gradient, a source nearer than a few baselines, moves the outputs in the free
+    directions too. Those in which the hidden source does not act tell how much: beyond their noise, and how it would
+    compare with what is seen along the source's own direction if that had `BENDING` times their mean.
+
+    Parameters
+    ----------
+    whitened, held, direction: as for `course_of`.
+    """
+    basis = free_directions(held)
+    d = basis.T @ direction
+    if len(d) < 2 or not d.any() or not len(whitened):
+        return False
+    z = whitened @ basis
+    own = float(np.mean((z @ d) ** 2)) / float(d @ d)
+    excess = float(np.mean(z**2)) * len(d) - own
+    excess = excess / (len(d) - 1) - 1.0
+    return excess > 1.0 and own - 1.0 < BENDING * excess
 
 
 def free_directions(held: Array) -> Array:

@@ -1,0 +1,100 @@
+"""What the verdict says of a rest that no error model describes: converters, louder noise, a base station elsewhere."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from loop_cases import Array, linear_state, synthetic
+
+from magtensor.loop.found import Search
+from magtensor.loop.model import Record
+from magtensor.loop.predictable import converter_words
+from magtensor.loop.unexplained import loud_words, unexplained
+from magtensor.verdict import sentence
+
+SAMPLES = 3000
+
+
+def told(record: Record) -> dict[str, object]:
+    state = linear_state(record)
+    return unexplained(Search(state, state, (), {}, {}, record, None), record)
+
+
+def converted(shape: str, seed: int, size: float = 0.4) -> Record:
+    """A converter of S2's y that is off by what its own output says: a wave, or the steps of a missing code."""
+    clean = synthetic(seed, SAMPLES, turning_s=4.0, noise_nT=0.15)
+    output = clean.raw[:, 1, 1]
+    wave = np.sin(2.0 * np.pi * output / 8000.0) if shape == "wave" else np.sign((output % 20000.0) - 10000.0)
+    added = np.zeros((SAMPLES, 4, 3))
+    added[:, 1, 1] = size * wave
+    return replace(clean, raw=clean.raw + added)
+
+
+@pytest.mark.parametrize("shape", ["wave", "steps"])
+def test_a_converter_that_is_not_linear_is_told(shape: str) -> None:
+    found = told(converted(shape, 5))
+    assert found["present"]
+    assert "S2 (y) add follows from what they read" in str(found["description"])
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_no_converter_is_accused_by_noise(seed: int) -> None:
+    added = np.zeros((SAMPLES, 4, 3))
+    added[:, 2] = np.cumsum(np.random.default_rng(seed).standard_normal((SAMPLES, 3)), axis=0) / 60.0
+    assert converter_words(linear_state(synthetic(seed, SAMPLES, turning_s=4.0, noise_nT=0.15))) == []
+    assert converter_words(linear_state(synthetic(seed, SAMPLES, turning_s=4.0, noise_nT=0.15, added=added))) == []
+    assert converter_words(linear_state(synthetic(seed, 150, noise_nT=0.15))) == []  # too few to ask
+
+
+def test_noise_that_is_louder_for_a_while_is_dated() -> None:
+    rng = np.random.default_rng(3)
+    added = np.zeros((SAMPLES, 4, 3))
+    added[1000:1400, 2] = 0.6 * rng.standard_normal((400, 3))
+    record = synthetic(3, SAMPLES, turning_s=4.0, noise_nT=0.15, added=added)
+    (words,) = loud_words(linear_state(record), record)
+    begin, end = (float(words.split()[i]) for i in (1, 3))
+    assert "the noise of S3" in words and begin == pytest.approx(1000, abs=15) and end == pytest.approx(1400, abs=15)
+    quiet = synthetic(3, SAMPLES, turning_s=4.0, noise_nT=0.15)
+    assert loud_words(linear_state(quiet), quiet) == []
+
+
+def beside(difference: Array) -> Record:
+    record = synthetic(7, SAMPLES, turning_s=4.0, noise_nT=0.15)
+    assert record.total_field is not None
+    return replace(record, total_field=record.total_field + difference, quiet_field=record.total_field + difference)
+
+
+def test_a_field_that_the_base_station_does_not_see_is_no_noise() -> None:
+    """A railway: direct current that comes and goes."""
+    rng = np.random.default_rng(8)
+    railway = np.repeat(rng.choice([0.0, 0.8, 2.0, -1.0], SAMPLES // 30), 30)
+    found = told(beside(railway - railway.mean()))
+    assert found["present"] and "in all sensors alike" in str(found["description"])
+
+
+def test_a_base_station_that_wanders_a_little_is() -> None:
+    found = told(beside(0.2 * np.sin(np.arange(SAMPLES) / 150.0)))
+    assert not found["present"]
+    assert "|b| - F is not white" in str(found["description"]) or float(str(found["excess_rms_nT"])) < 0.15
+
+
+@pytest.mark.parametrize(
+    ("kind", "words"), [("site", "modelled, not taken off"), ("instrument", "does not carry over")]
+)
+def test_a_site_that_was_modelled_is_in_another_survey_too(kind: str, words: str) -> None:
+    def block(error: float) -> dict[str, object]:
+        return {"total_field_rms_nT": {"all": error}, "tensor_rms_nT_per_m": None}
+
+    outcome = {
+        "declared": ["linear"],
+        "noise_floor_nT": 0.1,
+        "adopted": [{"error_model": "some", "kind": kind}],
+        "unexplained": {"present": False, "description": "", "excess_rms_nT": 0.0, "looks_like": []},
+        "error": {
+            "held_out": {"before": block(2.0), "after": block(0.2)},
+            "verify": {"before": block(2.0), "after": block(3.0)},
+        },
+    }
+    assert words in sentence(outcome)
