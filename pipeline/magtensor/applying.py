@@ -184,7 +184,14 @@ def apply_and_refine(
     from magtensor.platform_frame import as_fitted, with_refined_rotation
     from magtensor.standing_out import flagged
     from magtensor.tensor.elements import five
-    from magtensor.tensors import assembled, refined, refinement_noise, stored_assembly, stored_refinement
+    from magtensor.tensors import (
+        assembled,
+        noise_of_a_sample,
+        refined,
+        refinement_noise,
+        stored_assembly,
+        stored_refinement,
+    )
 
     turned: Tied | None = None
     survey = load_as(planned, path, tolerant=tolerant, rows=rows)
@@ -217,7 +224,8 @@ def apply_and_refine(
                 fitted = turned.calibration
                 turned = replace(turned, calibration=without_scatter(fitted, apart))
         if "calibration/tensor_gain" in calibration:
-            b, noise = survey.values("calibrated/b"), calibration.values("calibration/noise_std")
+            b = survey.values("calibrated/b")
+            noise = noise_of_a_sample(calibration, calibration.values("calibration/noise_std"))
             position = calibration.values("calibration/position")
             assembly = stored_assembly(calibration)
             off = taken_off(calibration, fitted, before, survey, adopted, theta, origins)

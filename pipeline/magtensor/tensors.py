@@ -49,6 +49,19 @@ def noise_variables(noise: Array) -> dict[str, Variable]:
     return {"calibration/noise_std": (("sensor", "axis"), noise, attributes)}
 
 
+def slow_noise_variables(slow: Array) -> dict[str, Variable]:
+    """`calibration/slow_noise_std`, from (3 S,) nT."""
+    attributes = {"units": "nT", "long_name": "slow noise of b beside the white one, rms over the calibration's survey"}
+    return {"calibration/slow_noise_std": (("sensor", "axis"), slow.reshape(-1, 3), attributes)}
+
+
+def noise_of_a_sample(calibration: Survey, white: Array) -> Array:
+    """(S, 3) nT, the noise of a single sample of b: the white one, and the slow one where it is known."""
+    if "calibration/slow_noise_std" not in calibration:
+        return white
+    return np.hypot(white, calibration.values("calibration/slow_noise_std"))
+
+
 def stored_assembly(calibration: Survey) -> Assembly:
     """The assembly that `assembly_variables` stored."""
     gain = calibration["calibration/tensor_gain"]
@@ -78,7 +91,8 @@ def assembled(
         assembly: the linear map.
         b: (N, S, 3) nT in one common frame.
         position: (S, 3) m.
-        noise: (S, 3) nT white noise of b; NaN where unknown, and the deviations then hold the calibration's part alone.
+        noise: (S, 3) nT noise of a sample of b; NaN where unknown, and the deviations then hold the calibration's part
+            alone.
         calibration: with its covariance.
         refinement: H (5, 5), D (5,) nT/m of Sui 2017 eq. 9 and their covariance (30, 30), where there is one.
         taken_off: the errors of effects that were corrected before, where they are known.

@@ -80,11 +80,14 @@ BESIDE_TENSOR = (
 )  # fmt: skip
 
 
+USED = ("total_field", "calibration/slow_noise_std")
+
+
 def touched_by_assembly(options: Mapping[str, Any]) -> Declares:
     """A tensor that is required needs positions; one that is not may stay away."""
     if options.get("required", True):
-        return Declares((*CALIBRATED, "position"), ("total_field",), (*TENSOR, "calibration/noise_std"), BESIDE_TENSOR)
-    return Declares(CALIBRATED, ("total_field", "position"), ("calibration/noise_std",), (*TENSOR, *BESIDE_TENSOR))
+        return Declares((*CALIBRATED, "position"), USED, (*TENSOR, "calibration/noise_std"), BESIDE_TENSOR)
+    return Declares(CALIBRATED, (*USED, "position"), ("calibration/noise_std",), (*TENSOR, *BESIDE_TENSOR))
 
 
 @stage(declares=touched_by_assembly)
@@ -99,10 +102,11 @@ def assemble_tensor(
     """Assemble the gradient tensor, its standard deviation and its invariants from the calibrated sensors.
 
     A method is ``f(position (S, 3) m, noise_covariance (3 S, 3 S) nT^2 or None, *, options) -> Assembly``. The
-    standard deviation holds the sensors' noise and the uncertainty of the calibration.
+    standard deviation holds the sensors' noise, slow noise too where `close_loop` has measured it, and the uncertainty
+    of the calibration.
     """
     from magtensor.calibration.noise import noise_std
-    from magtensor.tensors import assembled, assembly_variables, noise_variables
+    from magtensor.tensors import assembled, assembly_variables, noise_of_a_sample, noise_variables
 
     b = survey.values("calibrated/b")
     good = survey.good & np.isfinite(b).all(axis=(1, 2))
@@ -120,4 +124,5 @@ def assemble_tensor(
             leave_out = "`assemble_tensor: {required: false}` goes on without a tensor"
             raise NotEnoughData(error.what, where=error.where, hint=f"{error.hint}; {leave_out}") from error
         return noise_variables(noise)
-    return assembly_variables(assembly, position, noise) | assembled(assembly, b, position, noise, restored(survey))
+    each = noise_of_a_sample(survey, noise)
+    return assembly_variables(assembly, position, noise) | assembled(assembly, b, position, each, restored(survey))

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 @stage(
     needs=("b_raw", "total_field"),
     uses=("*", "reference/time", "reference/total_field"),
-    gives=(*COMMON, "loop/verdict"),
+    gives=(*COMMON, "loop/verdict", "calibration/slow_noise_std"),
     may_give=("residual/contrast", "good", "declared/matrix", "declared/offset"),
 )
 def close_loop(
@@ -74,8 +74,10 @@ def close_loop(
     from magtensor.loop.inquiry import inquiry_of
     from magtensor.loop.model import Fitting, with_colour
     from magtensor.loop.near_nominal import doubt_of, labelled, settled
+    from magtensor.loop.own_noise import OwnNoise
     from magtensor.loop.stored import cleaned, effect_variables
     from magtensor.loop.unexplained import unexplained
+    from magtensor.tensors import slow_noise_variables
 
     def inquired(how: Fitting) -> Inquiry:
         begun = inquiry_of(
@@ -104,6 +106,7 @@ def close_loop(
     same = len(found.last.adopted) == len(begin)
     seen = as_elsewhere(looked_at, calibrated(found.last.fit), found.last)
     after = before if same else held_out_error(seen, found.last.adopted, how, found.last.theta, keep, folds)
+    slow = slow_noise_variables(OwnNoise(found.last.residual, None).slow_std())
     found = inquiry.on_every_sample(found)
     first, last, record = found.first, with_colour(found.record, found.last, how), found.record
     calibration, errors = calibrated(last.fit), {}
@@ -124,7 +127,7 @@ def close_loop(
     given = common_frame(clean, calibration, "joint") | effect_variables(
         last.adopted, last.theta, record.origins, survey
     )
-    given |= errors
+    given |= errors | slow
     before_fit = np.linalg.norm(survey.values("b_raw"), axis=2) - survey.values("total_field")[:, None]
     given["residual/total_field_before"] = (("time", "sensor"), before_fit, {"units": "nT", "long_name": "|b_raw| - F"})
     alone = calibrated(first.fit)

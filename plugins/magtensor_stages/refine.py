@@ -55,7 +55,7 @@ def refine_invariants(
     where the invariants are not given.
     """
     from magtensor.tensor.elements import five
-    from magtensor.tensors import assembled, refined, refinement_variables, stored_assembly
+    from magtensor.tensors import assembled, noise_of_a_sample, refined, refinement_variables, stored_assembly
 
     tensor = survey.values("calibrated/tensor")
     use = survey.good & np.isfinite(tensor).all(axis=(1, 2))
@@ -87,7 +87,7 @@ def refine_invariants(
     coefficients = refinement.matrix, refinement.offset, refinement.covariance
     if "calibration/tensor_gain" not in survey:
         return stored | refined(five(tensor), refinement.noise_std, coefficients)
-    b, noise = survey.values("calibrated/b"), survey.values("calibration/noise_std")
+    b, noise = survey.values("calibrated/b"), noise_of_a_sample(survey, survey.values("calibration/noise_std"))
     position = survey.values("calibration/position")
     return stored | assembled(stored_assembly(survey), b, position, noise, restored(survey), coefficients)
 

@@ -84,6 +84,16 @@ class OwnNoise:
         explained = min(float(found @ inverse @ found) / freedom, 1.0)
         return float(betaincc(rank / 2.0, (freedom - rank) / 2.0, explained))
 
+    def slow_std(self) -> Array:
+        """(3 S,) nT, rms of the slow noise of each output beside its white noise; 0 of a single sensor."""
+        if self.residual.across is None:
+            return np.zeros(len(self.residual.noise))
+        each = np.diff(self._edges)
+        power = np.repeat(self._levels, each, axis=0) * self._root_across[:, None] ** 2
+        slow = np.sqrt(np.maximum(np.mean(power - power[-1], axis=0), 0.0))
+        out: Array = np.repeat(slow, 3) * self.residual.noise
+        return out
+
     def _across_of(self, terms: Terms) -> _Across | None:
         """What terms do across, and what C and o can do."""
         residual = self.residual
