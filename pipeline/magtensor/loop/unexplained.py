@@ -113,17 +113,31 @@ def loud_words(state: State, record: Record) -> list[str]:
     residual = state.residual
     if residual.across is None or len(residual.across) < 4 * LEAST_LOUD:
         return []
+    names = state.excitation.sensors
+    pairs = (
+        [(" and ".join(names), slice(None))]
+        if len(names) == 2
+        else [  # two have one contrast
+            (name, slice(3 * number, 3 * number + 3)) for number, name in enumerate(names)
+        ]
+    )
     words = []
-    for number, name in enumerate(state.excitation.sensors):
-        own = residual.across[:, 3 * number : 3 * number + 3]
-        rough = median_filter(np.sum(np.diff(own, axis=0) ** 2, axis=1), size=ABOUT, mode="mirror")
+    for name, own in pairs:
+        rough = np.sum(np.diff(residual.across[:, own], axis=0) ** 2, axis=1)
+        rough = median_filter(rough, size=ABOUT, mode="mirror")
         usual = float(np.median(rough))
         loud = rough > LOUD**2 * usual
         edges = np.flatnonzero(np.diff(loud.astype(int), prepend=0, append=0)).reshape(-1, 2)
-        for first, end in edges[np.diff(edges, axis=1)[:, 0] >= LEAST_LOUD]:
-            begin, until = (record.time[residual.samples[i]] - record.start for i in (first, end))
-            times = float(np.sqrt(np.median(rough[first:end]) / usual))
-            words.append(f"from {begin:.5g} to {until:.5g} s the noise of {name} is {times:.2g} times as loud as usual")
+        found = [(first, end) for first, end in edges if end - first >= LEAST_LOUD]
+        if not found:
+            continue
+        first, end = max(found, key=lambda stretch: stretch[1] - stretch[0])
+        begin, until = (record.time[residual.samples[i]] - record.start for i in (first, end))
+        times = float(np.sqrt(np.median(rough[first:end]) / usual))
+        others = f", and in {len(found) - 1} shorter stretches" if len(found) > 1 else ""
+        words.append(
+            f"from {begin:.5g} to {until:.5g} s the noise of {name} is {times:.2g} times as loud as usual{others}"
+        )
     return words
 
 
