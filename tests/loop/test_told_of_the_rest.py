@@ -77,7 +77,6 @@ def test_a_field_that_the_base_station_does_not_see_is_no_noise() -> None:
 def test_a_base_station_that_wanders_a_little_is() -> None:
     found = told(beside(0.2 * np.sin(np.arange(SAMPLES) / 150.0)))
     assert not found["present"]
-    assert "|b| - F is not white" in str(found["description"]) or float(str(found["excess_rms_nT"])) < 0.15
 
 
 @pytest.mark.parametrize(

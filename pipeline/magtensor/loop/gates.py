@@ -110,9 +110,9 @@ class Candidate:
         """Whether a model that acts in a part of the survey only predicts one part of that from the others.
 
         Then the folds of equal length are but one or two figures, which may gain much and tell no scatter. The short
-        folds in which it acts are not asked unless both its p value and noise of the residual's own colour leave no
-        doubt, and in noise of that colour it has to predict them as well. Only of what happens once or follows a
-        channel: a drift is everywhere, and short folds at its end say no more than that neighbours are alike.
+        folds in which it acts are not asked unless its p value and that in noise of the residual's own colour pass, and
+        in noise of that colour it has to predict them as well. Only of what happens once or follows a channel: a
+        drift is everywhere, and short folds at its end say no more than that neighbours are alike.
         """
         channel = any(isinstance(grid, AnyChannel) for grid in profiled(self.model.component).values())
         if not channel and not happens_once(self.model):

@@ -64,17 +64,17 @@ def solve(n: Array, y: Array, scale: Array) -> Estimate:
     n: (P, P), y: (P,).
     scale: (P,) information of each regressor before the fit's own freedom was projected off.
     """
-    basis, values = identifiable_with_information(n, scale)
+    basis, values = _directions(n, scale)
     inverse = basis / values @ basis.T
     return Estimate(inverse @ y, inverse, n, basis.shape[1])
 
 
 def identifiable(n: Array, scale: Array) -> Array:
     """(P, p) the directions that an information matrix (P, P) tells from nothing, `scale` as in `solve`."""
-    return identifiable_with_information(n, scale)[0]
+    return _directions(n, scale)[0]
 
 
-def identifiable_with_information(n: Array, scale: Array) -> tuple[Array, Array]:
+def _directions(n: Array, scale: Array) -> tuple[Array, Array]:
     """Identifiable directions (P, p) and their information (p,), in scaled coordinates undone again."""
     root = np.sqrt(np.maximum(scale, 1e-300))
     values, vectors = symmetric_eigen(n / np.outer(root, root))
@@ -183,7 +183,7 @@ def wald_p(g: Grams, chosen: Sequence[int], alone: Sequence[int] = (), most: int
     scale = own_information(g)
     others = np.setdiff1d(np.arange(g.count), [*chosen, *alone])
     full_n, full_y = _without_others(*normal(g.total()), subset, others, scale)
-    basis, values = identifiable_with_information(full_n[0], scale[subset])
+    basis, values = _directions(full_n[0], scale[subset])
     basis = basis[:, np.argsort(values)[::-1][:most]]
     p = basis.shape[1]
     if p == 0 or p >= count:

@@ -239,7 +239,7 @@ def _lacking(effect: Adopted, record: Record) -> str:
 
 
 def _ranges(record: Record) -> dict[str, list[float]]:
-    """Least and largest value of each channel, the calibration's mean taken off; those of several columns together."""
+    """Least and largest value of each channel, its origin taken off; those of several columns together."""
     return {name: [float(v.min()), float(v.max())] for name, v in record.logged.items()}
 
 
