@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 
 from magtensor.components import Component
-from magtensor.loop.assessment import WHITE, colours_of, estimated_in, likeliest
+from magtensor.loop.assessment import WHITE, assess, colours_of, estimated_in, likeliest
 from magtensor.loop.evidence import Whitened
 from magtensor.loop.excitation import Excitation
+from magtensor.loop.gates import ALONE
 from magtensor.loop.golden import golden
-from magtensor.loop.model import State, regressors
+from magtensor.loop.model import Adopted, State, generic, regressors
 from magtensor.loop.residual import Residual
 from magtensor.loop.scoring import Scorer
 from magtensor.loop.separation import SEPARATION
@@ -123,7 +124,11 @@ def begun(
     model: Component, settings: dict[str, Any], state: State, few: tuple[Residual, Terms | None]
 ) -> dict[str, Any]:
     """Settings of a model with the lag and the beginning that explain most together, if the data separate them from
-    those given. Of powers of a channel the lowest alone is asked."""
+    those given. Of powers of a channel the lowest alone is asked.
+
+    What dies away says nothing of the channel. One that nobody wrote a model for is believed for its own course: it has
+    to be seen beside what dies away, or it stays in equilibrium.
+    """
     found = beginning(model, settings)
     if found is None:
         return settings
@@ -157,8 +162,21 @@ def begun(
     alone = what_dies_away(terms, best, names, widest)  # warming up, say, and no response to the channel
     if fair(terms(best)) <= max(fair(terms(settings)), fair(alone)) + least_gain(names):
         return settings
+    if generic(Adopted(model, best)) and not _seen_beside(
+        alone, terms({**best, **dict.fromkeys(names, 0.0)}), state, few
+    ):
+        return settings
     low, high = lags[max(nearest - 1, 0)], lags[min(nearest + 1, len(lags) - 1)]
     return with_lag(golden(gain, low, high, lags[nearest])) or best
+
+
+def _seen_beside(alone: Terms, settled: Terms, state: State, few: tuple[Residual, Terms | None]) -> bool:
+    """Whether a response in equilibrium shows and predicts held-out blocks beside what dies away."""
+    residual, given = few
+    beside = alone if given is None else joined([given, alone])
+    colours = likeliest(residual, beside, [state.colours, WHITE]).colours
+    found = assess(Whitened.of(residual, colours.across, colours.along, beside), settled)
+    return found.p < ALONE and found.gain.consistent
 
 
 def least_gain(names: Sequence[str]) -> float:

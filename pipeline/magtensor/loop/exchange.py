@@ -13,8 +13,8 @@ from dataclasses import replace
 from magtensor.loop.contribution import put_back, slices
 from magtensor.loop.found import Step
 from magtensor.loop.gates import Candidate
-from magtensor.loop.model import State
-from magtensor.loop.screening import candidates_of, generic
+from magtensor.loop.model import State, generic
+from magtensor.loop.screening import candidates_of
 from magtensor.loop.separation import fold_gain, separated
 
 

@@ -153,6 +153,11 @@ class Adopted:
         return every.only(i for i, s in enumerate(every.sensors) if s in self.sensors or s == "")
 
 
+def generic(model: Adopted) -> bool:
+    """A model of anything that follows a channel says less than one that names a cause."""
+    return model.name in ("channel_response", "latent_source")
+
+
 @dataclass(frozen=True)
 class State:
     """A calibration with its error models, fitted.

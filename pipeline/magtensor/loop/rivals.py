@@ -9,8 +9,7 @@ from magtensor.loop.beginnings import beginning
 from magtensor.loop.contribution import happens_once
 from magtensor.loop.excitation import Excitation
 from magtensor.loop.gates import OF_THE_LAW, SECOND_ORDER, Candidate
-from magtensor.loop.model import State
-from magtensor.loop.screening import generic
+from magtensor.loop.model import State, generic
 from magtensor.loop.separation import SEPARATION, fold_gain, separated
 from magtensor.loop.settings import AnyChannel, profiled
 from magtensor.loop.several_logs import worse_log

@@ -14,7 +14,7 @@ from magtensor.loop.contribution import happens_once
 from magtensor.loop.evidence import Whitened
 from magtensor.loop.gates import Candidate, explained_before
 from magtensor.loop.log_noise import brought_in, channels_of
-from magtensor.loop.model import Adopted, State
+from magtensor.loop.model import Adopted, State, generic
 from magtensor.loop.profiling import REFINING_SAMPLES, SCREENING_SAMPLES, Thinned, best_settings, refined, terms_of
 from magtensor.loop.scoring import Scorer
 from magtensor.loop.separation import Assessed, lower_orders, lowest
@@ -159,8 +159,3 @@ def _one_each(state: State, assessed: Sequence[Assessed]) -> list[Assessed]:
 def _log_noise(state: State, model: Adopted, terms: Terms, assessment: Assessment) -> float:
     same = brought_in(state, channels_of(model, state.excitation)) if generic(model) else 0.0
     return max(same, of_another_log(state, model, terms, assessment.estimate))
-
-
-def generic(model: Adopted) -> bool:
-    """A model of anything that follows a channel says less than one that names a cause."""
-    return model.name in ("channel_response", "latent_source")

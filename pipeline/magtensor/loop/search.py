@@ -22,13 +22,13 @@ from magtensor.loop.found import Search, Step
 from magtensor.loop.gates import ALPHA, Candidate
 from magtensor.loop.latent import NAME, SINGLE_STRETCH, Sought, Source, renewed, sought, tried_source
 from magtensor.loop.log_noise import channels_of
-from magtensor.loop.model import Adopted, Fitting, Record, State, joint_state, of_the_site
+from magtensor.loop.model import Adopted, Fitting, Record, State, generic, joint_state, of_the_site
 from magtensor.loop.needs import missing
 from magtensor.loop.overshadowed import overshadowed
 from magtensor.loop.own_fit import at_their_own_fit
 from magtensor.loop.profiling import already, repeatable
 from magtensor.loop.rivals import containing, hardly_begun, simplest
-from magtensor.loop.screening import candidates_of, generic
+from magtensor.loop.screening import candidates_of
 from magtensor.loop.spectrum import spectral_lines
 from magtensor.loop.trial import Trial, on_the_folds_of, per_sample, trial
 
