@@ -13,7 +13,13 @@ from magtensor_effects.inertia import (
     viscous_magnetisation,
 )
 from magtensor_effects.latent import latent_source
-from magtensor_effects.mechanics import crosstalk, frame_flexure, turn_step
+from magtensor_effects.mechanics import (
+    alignment_drift,
+    crosstalk,
+    frame_flexure,
+    temperature_alignment,
+    turn_step,
+)
 from magtensor_effects.power import current_field, supply_offset, supply_scale
 from magtensor_effects.reference import reference_clock, reference_drift, reference_scale, reference_step
 from magtensor_effects.site import fixed_source, passing_source, site_gradient
@@ -21,6 +27,7 @@ from magtensor_effects.temperature import temperature_offset, temperature_rate, 
 from magtensor_effects.transfer import cross_field, hysteresis, nonlinearity_cubic, nonlinearity_quadratic
 
 __all__ = [
+    "alignment_drift",
     "averaging",
     "bandwidth",
     "baseline_expansion",
@@ -55,6 +62,7 @@ __all__ = [
     "site_gradient",
     "supply_offset",
     "supply_scale",
+    "temperature_alignment",
     "temperature_offset",
     "temperature_rate",
     "temperature_scale",

@@ -9,13 +9,21 @@ from magtensor.attitude import into_platform
 from magtensor.calibration.types import Array
 from magtensor.components import error_model
 from magtensor.loop.excitation import AXES, Excitation
-from magtensor.loop.settings import Range
+from magtensor.loop.settings import Orders, Range
 from magtensor.loop.terms import Terms, joined
 from magtensor.units import GRAVITY
-from magtensor_effects.ageing import EventTime
+from magtensor_effects.ageing import EventTime, Span
+from magtensor_effects.forms import AtStart, Delayed
+from magtensor_effects.temperature import THERMOMETER, ThermalLag, Thermometer
 
 ARCMIN = np.pi / (180.0 * 60.0)
 UP = np.array([0.0, 0.0, 1.0])
+
+Angles = Annotated[
+    int,
+    Orders((3, 6)),
+    Field(description="3: each sensor turns as a whole; 6: the angles between its axes change too"),
+]
 
 
 @error_model(
@@ -71,8 +79,78 @@ def turn_step(x: Excitation, *, time_s: EventTime = 0.0) -> Terms:
     Rivals: `scale_step` and `offset_step` where the attitude hardly changes.
     """
     after = (x.elapsed >= time_s)[:, None, None]
-    turned = [x.sensed(np.cross(x.field, axis * ARCMIN)) * after for axis in np.eye(3)]
-    return joined([x.one_each(t, "arcmin", name) for t, name in zip(turned, AXES, strict=True)])
+    return joined([x.one_each(after * t, "arcmin", name) for name, t in _by_an_arcmin(x, 3)])
+
+
+@error_model(
+    "instrument",
+    needs=("temperature*",),
+    source="small rotation in proportion to the temperature; angles between the axes as in Olsen et al. 2003 (Oersted)",
+    typical="seconds of arc per degC: 1 arcsec is 0.24 nT in 50 000 nT",
+    pointwise=True,
+)
+def temperature_alignment(
+    x: Excitation,
+    *,
+    channel: Thermometer = "",
+    lag_s: ThermalLag = 0.0,
+    delayed: Delayed = False,
+    at_start: AtStart = 0.0,
+    angles: Angles = 3,
+) -> Terms:
+    """Each sensor's axes turn as its temperature changes: a mount that expands, a core that warps.
+
+    C (b x e) times the lagged temperature, e the rotation vector in the platform frame; with six angles also the
+    symmetric part, by which two axes of a sensor lean towards each other. What turns all sensors alike is not visible
+    without a vector reference. Rivals: `temperature_scale` where few attitudes are seen; `alignment_drift` where the
+    temperature rises steadily; `turn_step`.
+    """
+    name = THERMOMETER.pick(x, channel)
+    course = x.thermometer(name, lag_s, delayed, at_start).reshape(len(x.time), -1, 1)
+    units = f"arcmin/{x.units[name]}"
+    return joined([x.one_each(course * t, units, label) for label, t in _by_an_arcmin(x, angles)])
+
+
+@error_model(
+    "instrument",
+    source="small rotation that grows with time",
+    typical="a glue that creeps, a screw that settles: arcmin, 14.5 nT each in 50 000 nT",
+)
+def alignment_drift(
+    x: Excitation,
+    *,
+    tau_s: Annotated[
+        float,
+        Range(0.05, 5.0, count=5, spacing="log", of_duration=True),
+        Field(gt=0, description="time constant with which it comes to rest, s; long: it turns steadily"),
+    ] = 3600.0,
+    span_s: Span = 3600.0,
+    angles: Angles = 3,
+) -> Terms:
+    """Each sensor's axes turn with time and come to rest.
+
+    As `temperature_alignment`, with a course from 0 at the start to 1 after span_s that settles with tau_s in the place
+    of the temperature: the coefficients are the angles turned by in the survey. It is not predicted beyond span_s.
+    Rivals: `temperature_alignment` where the temperature rises steadily; `turn_step`; `scale_drift` where few attitudes
+    are seen.
+    """
+    course = np.expm1(-np.clip(x.elapsed, 0.0, span_s) / tau_s) / np.expm1(-span_s / tau_s)
+    return joined([x.one_each(course[:, None, None] * t, "arcmin", label) for label, t in _by_an_arcmin(x, angles)])
+
+
+def _by_an_arcmin(x: Excitation, angles: int) -> list[tuple[str, Array]]:
+    """Label and (N, S, 3) nT: what each sensor reads more when it turns by an arcmin about an axis of the platform, and
+    of six angles also when two of its own axes lean by as much towards each other."""
+    turned = [(name, x.sensed(np.cross(x.field, axis * ARCMIN))) for name, axis in zip(AXES, np.eye(3), strict=True)]
+    if angles == 3:
+        return turned
+    read = ARCMIN * x.driving(of_field=True)
+    leaning = []
+    for i, j in ((0, 1), (0, 2), (1, 2)):
+        more = np.zeros_like(read)
+        more[..., i], more[..., j] = read[..., j], read[..., i]
+        leaning.append((AXES[i] + AXES[j], more))
+    return [*turned, *leaning]
 
 
 @error_model(

@@ -267,6 +267,49 @@ def test_turn_step_in_arcmin() -> None:
     np.testing.assert_allclose(per_axis(fit, survey.sensors), truth_of(survey), atol=0.01)
 
 
+def test_a_mount_that_turns_as_it_warms_in_arcmin_per_degree() -> None:
+    effect = {"arcmin_per_degC": drawn(1), "lag_s": 40.0}
+    fit, survey, _ = fitted("temperature_alignment", {"lag_s": 40.0}, effect)
+    assert fit.left < 0.01
+    np.testing.assert_allclose(per_axis(fit, survey.sensors), truth_of(survey), atol=0.03)
+
+
+def test_a_mount_that_creeps_in_arcmin() -> None:
+    # second order of 3 arcmin: 1e-3
+    settings = {"tau_s": 100.0, "span_s": SPAN_S}
+    fit, survey, _ = fitted("alignment_drift", settings, {"arcmin": drawn(3), "tau_s": 100.0})
+    assert fit.left < 0.005
+    whole = (1.0 - np.exp(-SPAN_S / 100.0)) * truth_of(survey)
+    np.testing.assert_allclose(per_axis(fit, survey.sensors), whole, atol=0.01)
+
+
+def test_a_mount_stays_where_the_survey_left_it() -> None:
+    x = excitation(simulated("alignment_drift", arcmin=[1.0, 1.0, 1.0]))
+    moved = magtensor_effects.alignment_drift(x, tau_s=40.0, span_s=90.0).series
+    settled = magtensor_effects.alignment_drift(x, tau_s=1e-3, span_s=1.0).series
+    after = x.elapsed >= 90.0
+    np.testing.assert_allclose(moved[after], settled[after])
+
+
+@pytest.mark.parametrize(("i", "j"), [(0, 1), (0, 2), (1, 2)])
+def test_axes_that_lean_towards_each_other_as_they_warm(i: int, j: int) -> None:
+    """Two unit vectors that lean by an arcmin each: by hand, from the field in each sensor's own axes."""
+    survey = simulated("temperature_offset", nT_per_degC=[0.0, 0.0, 0.0])
+    x = excitation(survey)
+    warmer = x.thermometer("temperature", 0.0, False, 0.0).reshape(len(x.time), -1)[:, :1]
+    read = np.einsum(
+        "sij,nsj->nsi", x.matrix, np.broadcast_to(x.field_or_fields.reshape(len(x.time), -1, 3), x.output.shape)
+    )
+    lean = np.arctan(np.tan(np.pi / 10800.0))
+    expected = np.zeros_like(read)
+    expected[..., i] = warmer * (np.sin(lean) * read[..., j] + (np.cos(lean) - 1.0) * read[..., i])
+    expected[..., j] = warmer * (np.sin(lean) * read[..., i] + (np.cos(lean) - 1.0) * read[..., j])
+    terms = magtensor_effects.temperature_alignment(x, angles=6)
+    chosen = terms.only(k for k, name in enumerate(terms.names) if name == "xyz"[i] + "xyz"[j])
+    made = chosen.contribution(np.ones(chosen.count), x.output.shape[1] * 3).reshape(expected.shape)
+    np.testing.assert_allclose(made, expected, atol=1e-3 * np.abs(expected).max())
+
+
 @pytest.mark.parametrize(("name", "units"), [("temperature_offset", "nT"), ("temperature_scale", "ppm")])
 def test_the_second_order_of_temperature_holds_the_first(name: str, units: str) -> None:
     # b (T - 20 degC)^2, lagged: about the mean of the survey it has a linear part of 2 b (mean - 20)

@@ -136,4 +136,3 @@ def test_what_dies_away_is_no_response_to_the_temperature_that_began_with_it(see
     (adopted,) = verdict_of(tmp_path, scenario(seed, effect, **changes), models=models)["adopted"]
     assert adopted["error_model"] == "warm_up" and adopted["sensors"] == ["S1", "S4"]
     assert adopted["settings"]["tau_s"] == pytest.approx(150.0, rel=0.1)
-    assert "temperature_rate" in adopted["indistinguishable_from"]

@@ -1,4 +1,4 @@
-"""The first gate: by the scatter over blocks, or by noise of the residual's own colour where the blocks bear it out."""
+"""The first gate: by the scatter over blocks, or by the sensors' own spectra where the blocks bear it out."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ import pytest
 from loop_cases import Array, linear_state, synthetic
 from scipy.special import chdtrc, chdtri
 
-from magtensor.loop.assessment import assess, estimated_in, explained, slow_noise_of
+from magtensor.loop.assessment import BORNE_OUT, assess, estimated_in, explained, slow_noise_of
 from magtensor.loop.evidence import Whitened
-from magtensor.loop.gates import ALONE, ALPHA, UNLIKELY, Candidate
+from magtensor.loop.gates import ALPHA, Candidate
+from magtensor.loop.model import Adopted
 from magtensor.loop.outcome import why
 from magtensor.loop.screening import candidates_of
 from magtensor.loop.search import with_lines
-from magtensor.loop.statistics import Gain
 from magtensor.loop.terms import Terms
 from magtensor.registry import Registry
 
@@ -39,29 +39,33 @@ def one() -> Candidate:
 
 
 @pytest.mark.parametrize(
-    ("p", "adjusted_p", "null_p", "gain", "tried", "significant"),
+    ("p", "adjusted_p", "own_p", "tried", "significant"),
     [
-        (1e-9, 0.9 * ALPHA, 1.0, -1.0, 1.0, True),  # the blocks alone
-        (0.9 * ALONE, 0.3, 0.9 * UNLIKELY * ALPHA, 1.0, 1.0, True),
-        (1.1 * ALONE, 0.3, 0.9 * UNLIKELY * ALPHA, 1.0, 1.0, False),  # the blocks do not bear it out
-        (0.9 * ALONE, 0.3, 1.1 * UNLIKELY * ALPHA, 1.0, 1.0, False),  # not unlikely enough in that noise
-        (0.9 * ALONE, 0.3, 0.9 * UNLIKELY * ALPHA, -1.0, 1.0, False),  # it predicts nothing in that noise
-        (0.9 * ALONE, 0.3, 0.9 * UNLIKELY * ALPHA, 1.0, 60.0, False),  # one of sixty settings may do as well
+        (1e-9, 0.9 * ALPHA, 1.0, 1.0, True),  # the blocks alone
+        (0.9 * BORNE_OUT, 0.3, 0.9 * ALPHA, 1.0, True),
+        (1.1 * BORNE_OUT, 0.3, 0.9 * ALPHA, 1.0, False),  # the blocks do not bear it out
+        (0.9 * BORNE_OUT, 0.3, 1.1 * ALPHA, 1.0, False),  # not unlikely enough in that noise
+        (0.9 * BORNE_OUT, 0.3, 0.9 * ALPHA, 2.0, False),  # the better of two settings may do as well
     ],
 )
 def test_two_ways_to_pass(
-    one: Candidate, p: float, adjusted_p: float, null_p: float, gain: float, tried: float, significant: bool
+    one: Candidate, p: float, adjusted_p: float, own_p: float, tried: float, significant: bool
 ) -> None:
-    null_gain = Gain(np.array([1.0 + gain, 1.0]), np.ones(2), np.full(2, 10.0))
     changed = replace(
-        one,
-        tried=tried,
-        adjusted_p=adjusted_p,
-        adjusted_null_p=null_p,
-        assessment=replace(one.assessment, p=p, null_gain=null_gain),
+        one, tried=tried, adjusted_p=adjusted_p, adjusted_own_p=own_p, assessment=replace(one.assessment, p=p)
     )
     assert changed.significant is significant
-    assert ("own colour" in why(changed, None)) is (significant and adjusted_p > ALPHA)
+    assert ("own spectrum" in why(changed, None)) is (significant and adjusted_p > ALPHA)
+
+
+@pytest.mark.parametrize(("name", "significant"), [("eddy_current", True), ("periodic_interference", False)])
+def test_a_tone_has_one_way_to_pass(one: Candidate, name: str, significant: bool) -> None:
+    """Its frequency is the strongest line of a spectrum that knows nothing of having been searched."""
+    model = Adopted(Registry.load().find("error_model", name), {})
+    changed = replace(
+        one, model=model, tried=1.0, adjusted_p=0.3, adjusted_own_p=1e-9, assessment=replace(one.assessment, p=1e-3)
+    )
+    assert changed.significant is significant
 
 
 def test_a_weak_turn_that_twelve_blocks_cannot_prove_among_the_whole_catalogue() -> None:
@@ -81,7 +85,7 @@ def test_what_happens_once_has_one_way_to_pass() -> None:
     turned[700:, 1] = 2e-5 * np.cross([0.4, -0.8, 0.6], field[700:] - field.mean(0))
     found = {c.model.name: c for c in candidates(8, turned)}["turn_step"]
     weak = replace(found, tried=1.0, adjusted_p=0.3, assessment=replace(found.assessment, p=1e-5))
-    assert weak.adjusted_null_p < UNLIKELY * ALPHA and not weak.significant
+    assert weak.adjusted_null_p < 0.02 * ALPHA and not weak.significant
 
 
 @pytest.mark.parametrize(("walking", "low", "high"), [((0,), 2.5, 3.2), ((0, 1, 2, 3), 0.5, 1.6), ((), 0.7, 1.4)])

@@ -97,3 +97,14 @@ def test_a_site_that_was_modelled_is_in_another_survey_too(kind: str, words: str
         },
     }
     assert words in sentence(outcome)
+
+
+@pytest.mark.parametrize(("wandering_nT", "told_of"), [(0.0, True), (2.0, False)])
+def test_a_line_is_told_where_it_is_much_of_what_is_left(wandering_nT: float, told_of: bool) -> None:
+    time = np.arange(SAMPLES)
+    added = np.zeros((SAMPLES, 4, 3))
+    added[:, 1] = 0.1 * np.sin(2.0 * np.pi * time / 7.3)[:, None] * np.array([0.6, -0.6, 0.5])
+    walk = np.cumsum(np.random.default_rng(4).standard_normal((SAMPLES, 3)), axis=0)
+    added[:, 2] = wandering_nT * walk / walk.std(axis=0)
+    words = str(told(synthetic(4, SAMPLES, turning_s=4.0, noise_nT=0.15, added=added))["description"])
+    assert ("a line at 0.137 Hz" in words) is told_of

@@ -37,6 +37,8 @@ EVERY: dict[str, dict[str, Any]] = {
     "offset_step": {"time_s": [20.0, 45.0]},
     "scale_step": {"time_s": [20.0, 45.0]},
     "turn_step": {"time_s": 20.0},
+    "temperature_alignment": {"lag_s": 5.0},
+    "alignment_drift": {"tau_s": 20.0},
     "sampling_lag": {"per_axis": True},
     "lag_step": {"time_s": 20.0},
     "averaging": {},

@@ -21,6 +21,7 @@ LEAST_PER_BLOCK = 4
 NEARLY_ALL = 0.9  # of what is explained: the average colour of the sensors' noise then has to suit one of them
 SLOWEST = 20  # part of the frequencies that count as slow
 LEAST_SLOWEST = 30
+BORNE_OUT = 0.05  # probability by blocks below which another noise is asked
 _ROUNDS = 3  # the colour depends on the coefficients and they on it; after three nothing moves
 
 
@@ -70,8 +71,10 @@ class Assessment:
             None where a few blocks know nearly all.
         p: that all coefficients are zero, from the scatter over blocks; of what happens once, from noise of each
             sensor's own spectrum.
-        null_p: the same from what they explain in noise of the colour that the residual has without them, stronger
-            where it is all in one sensor with more slow noise than the others.
+        own_p: of what happens once the same as p; of what lasts that from noise of each sensor's own spectrum, 1 where
+            the blocks do not bear the test out.
+        null_p: that from what they explain in noise of the colour that the residual has without them, stronger where it
+            is all in one sensor with more slow noise than the others.
         colours: under the hypothesis that the terms are real.
         theta: the likeliest coefficients, with any colour: where a joint fit begins.
     """
@@ -82,6 +85,7 @@ class Assessment:
     focused: Gain | None
     null_focused: Gain | None
     p: float
+    own_p: float
     null_p: float
     colours: Colours
     theta: Array
@@ -112,7 +116,6 @@ def assess(now: Whitened, terms: Terms, *, once: bool = False) -> Assessment:
     residual, given = now.residual, now.given
     together = terms if given is None else joined([given, terms])
     first = together.count - terms.count
-    own = list(range(first, together.count))
     blocked = np.arange(together.count) < first
     count = block_count(len(residual.affine))
     null = grams_in(now, terms, count)
@@ -124,10 +127,12 @@ def assess(now: Whitened, terms: Terms, *, once: bool = False) -> Assessment:
     stronger = slow_noise_of(sensor, taken_off(residual, together, best.theta), now.across)
     null_p = _p_of(null, first, max(stronger, 1.0))
     blocks = grams(residual, together, colours.across, colours.along, count)
-    p = OwnNoise(residual, given).p_value(terms) if once else family_p(blocks, together.sensors, own)
+    by_blocks = 0.0 if once else family_p(blocks, together.sensors, range(first, together.count))
+    own_p = OwnNoise(residual, given).p_value(terms) if by_blocks < BORNE_OUT else 1.0
+    p = own_p if once else by_blocks
     gain = held_out_gain(blocks, residual.freedom, blocked)
     focused = focused_gain(blocks, residual.freedom, blocked)
-    return Assessment(_estimate(blocks), gain, null_gain, focused, null_focused, p, null_p, colours, best.theta)
+    return Assessment(_estimate(blocks), gain, null_gain, focused, null_focused, p, own_p, null_p, colours, best.theta)
 
 
 @dataclass(frozen=True)

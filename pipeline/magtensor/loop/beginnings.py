@@ -12,7 +12,6 @@ from magtensor.components import Component
 from magtensor.loop.assessment import WHITE, assess, colours_of, estimated_in, likeliest
 from magtensor.loop.evidence import Whitened
 from magtensor.loop.excitation import Excitation
-from magtensor.loop.gates import ALONE
 from magtensor.loop.golden import golden
 from magtensor.loop.model import Adopted, State, generic, regressors
 from magtensor.loop.residual import Residual
@@ -22,6 +21,7 @@ from magtensor.loop.settings import AnyChannel, Beginning, Orders, profiled
 from magtensor.loop.terms import Terms, joined
 
 WIDEST = 10.0  # a body brought out of a warm car, over the width of what the thermometer tells during the survey
+_ALONE = 1e-3  # probability that a channel is taken for seen beside what dies away, in a single test by blocks
 _SLOPE = 1e-3  # of the widest beginning, over which the regressors' change is taken
 
 
@@ -153,21 +153,28 @@ def begun(
         return -np.inf if found is None else score(terms(found))
 
     lags = sorted(v for v in {settings[mark.lag], *grids[mark.lag].values(x)} if v > 0)
-    nearest = max(range(len(lags)), key=lambda i: gain(lags[i]), default=None)
-    best = None if nearest is None else with_lag(lags[nearest])
-    if nearest is None or best is None:
+    best = with_lag(_refined(gain, lags)) if lags else None
+    if best is None:
         return settings
     together = terms(best) if given is None else joined([given, terms(best)])
     fair = Scorer(residual, given, likeliest(residual, together, [colours_of(residual), WHITE]).colours)
-    alone = what_dies_away(terms, best, names, widest)  # warming up, say, and no response to the channel
-    if fair(terms(best)) <= max(fair(terms(settings)), fair(alone)) + least_gain(names):
+
+    def alone(lag: float) -> Terms:  # warming up, say, and no response to the channel
+        return what_dies_away(terms, {**best, mark.lag: lag}, names, widest)
+
+    dying = alone(_refined(lambda lag: fair(alone(lag)), lags))
+    if fair(terms(best)) <= max(fair(terms(settings)), fair(dying)) + least_gain(names):
         return settings
-    if generic(Adopted(model, best)) and not _seen_beside(
-        alone, terms({**best, **dict.fromkeys(names, 0.0)}), state, few
-    ):
+    settled = terms({**best, **dict.fromkeys(names, 0.0)})
+    if generic(Adopted(model, best)) and not _seen_beside(dying, settled, state, few):
         return settings
-    low, high = lags[max(nearest - 1, 0)], lags[min(nearest + 1, len(lags) - 1)]
-    return with_lag(golden(gain, low, high, lags[nearest])) or best
+    return best
+
+
+def _refined(gain: Callable[[float], float], lags: Sequence[float]) -> float:
+    """The lag of the largest gain, between the neighbours of the best of those given."""
+    place = max(range(len(lags)), key=lambda i: gain(lags[i]))
+    return golden(gain, lags[max(place - 1, 0)], lags[min(place + 1, len(lags) - 1)], lags[place])
 
 
 def _seen_beside(alone: Terms, settled: Terms, state: State, few: tuple[Residual, Terms | None]) -> bool:
@@ -176,7 +183,7 @@ def _seen_beside(alone: Terms, settled: Terms, state: State, few: tuple[Residual
     beside = alone if given is None else joined([given, alone])
     colours = likeliest(residual, beside, [state.colours, WHITE]).colours
     found = assess(Whitened.of(residual, colours.across, colours.along, beside), settled)
-    return found.p < ALONE and found.gain.consistent
+    return found.p < _ALONE and found.gain.consistent
 
 
 def least_gain(names: Sequence[str]) -> float:

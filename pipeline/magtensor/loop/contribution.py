@@ -14,7 +14,7 @@ from magtensor.loop.evidence import Grams, Whitened, grams
 from magtensor.loop.model import Adopted, Fitting, Record, State, joint_state
 from magtensor.loop.own_noise import OwnNoise
 from magtensor.loop.residual import Residual, taken_off
-from magtensor.loop.settings import EventTimes, profiled
+from magtensor.loop.settings import EventTimes, Frequencies, profiled
 from magtensor.loop.statistics import Gain, family_p, held_out_gain
 from magtensor.loop.terms import Terms
 from magtensor.loop.trial import WORST_RISE
@@ -154,6 +154,11 @@ def _lasts(model: Adopted) -> bool:
 def happens_once(model: Adopted) -> bool:
     """Whether a model is of an event, whose time is a setting."""
     return any(isinstance(g, EventTimes) for g in profiled(model.component).values())
+
+
+def a_tone(model: Adopted) -> bool:
+    """Whether a model is of a tone, whose frequency is where the spectrum of what is left is strongest."""
+    return any(isinstance(g, Frequencies) for g in profiled(model.component).values())
 
 
 def agrees(state: State, place: int) -> bool:

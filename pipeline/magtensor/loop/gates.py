@@ -6,17 +6,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from magtensor.loop.assessment import Assessment
-from magtensor.loop.contribution import happens_once
+from magtensor.loop.assessment import BORNE_OUT, Assessment
+from magtensor.loop.contribution import a_tone, happens_once
 from magtensor.loop.model import Adopted, State
 from magtensor.loop.residual import taken_off
 from magtensor.loop.settings import AnyChannel, profiled
 from magtensor.loop.terms import Terms, joined
 
 ALPHA = 0.005  # family-wise probability that a clean survey gets an adoption, before the second gate
-ALONE = 1e-3  # probability that a single test by blocks is passed, which bears noise's own colour out
-AMONG_ITS_SETTINGS = 0.05  # the same, that the test with the best of a model's settings is
-UNLIKELY = 0.02  # of the family-wise probability: asked for in noise of the residual's own colour
 SECOND_ORDER = 1e-5  # of the sum of squares that is explained: 0.3 % of an effect's size
 OF_THE_LAW = 0.0025  # the same, that the law of an effect may miss: 5 % of its size
 LEAST_REDUCTION = 1e-4  # of the held-out sum of squares: smaller is significant only in very long surveys
@@ -34,6 +31,7 @@ class Candidate:
         terms: at the residual's samples.
         assessment: of the terms, given the models adopted before.
         adjusted_p: after the correction for settings and for the number of models.
+        adjusted_own_p: the same in noise of each sensor's own spectrum.
         adjusted_null_p: the same for what it explains in noise of the residual's own colour.
         alpha: what the adjusted p has to stay below.
         log_noise: what noise in the log of its channel, brought in by a model adopted before, lets it gain.
@@ -46,6 +44,7 @@ class Candidate:
     terms: Terms
     assessment: Assessment
     adjusted_p: float
+    adjusted_own_p: float
     adjusted_null_p: float
     alpha: float = ALPHA
     log_noise: float = 0.0
@@ -54,8 +53,9 @@ class Candidate:
 
     def among(self, models: int) -> Candidate:
         """The same, found among so many models rather than by itself."""
-        p, null_p = (min(1.0, each * max(models, 1)) for each in (self.adjusted_p, self.adjusted_null_p))
-        return replace(self, adjusted_p=p, adjusted_null_p=null_p)
+        each = self.adjusted_p, self.adjusted_own_p, self.adjusted_null_p
+        p, own_p, null_p = (min(1.0, value * max(models, 1)) for value in each)
+        return replace(self, adjusted_p=p, adjusted_own_p=own_p, adjusted_null_p=null_p)
 
     @property
     def of_the_log(self) -> bool:
@@ -75,16 +75,15 @@ class Candidate:
     def significant(self) -> bool:
         """Whether noise does not explain it, all that was tried considered.
 
-        By its p value alone. Or, because a dozen long blocks tell little of what is very unlikely, in noise of the
-        colour that the residual has without the model, in which it then predicts held-out blocks as well, if the
-        blocks bear it out as a test of this model alone. The p value of what happens once is not from blocks.
+        By its p value alone. Or, because a dozen long blocks tell little of what is very unlikely, in noise of each
+        sensor's own spectrum, if the blocks bear it out as a test of this model alone. The p value of what happens once
+        is not from blocks, and of a tone that spectrum does not know that its strongest line was taken.
         """
         if self.adjusted_p < self.alpha:
             return True
-        if happens_once(self.model):
+        if happens_once(self.model) or a_tone(self.model):
             return False
-        unlikely = self.adjusted_null_p < UNLIKELY * self.alpha and self.assessment.null_gain.total > 0
-        return unlikely and self.assessment.p < ALONE and self.assessment.p * self.tried < AMONG_ITS_SETTINGS
+        return self.adjusted_own_p < self.alpha and self.assessment.p * self.tried < BORNE_OUT
 
     @property
     def beyond_slow_noise(self) -> bool:

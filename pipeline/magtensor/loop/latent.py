@@ -188,8 +188,8 @@ def tried_source(
     model = Adopted(component, {"noise_nT": [float(v) for v in _own_noise(after)]})
     after = replace(after, adopted=(*after.adopted[:-1], model))
     gain = found.gain
-    evidence = Assessment(estimate, gain, gain, None, None, found.p, found.p, state.colours, estimate.theta)
-    return found, Source(record, after, Candidate(model, 1, terms, evidence, found.p, found.p, ALPHA))
+    evidence = Assessment(estimate, gain, gain, None, None, found.p, found.p, found.p, state.colours, estimate.theta)
+    return found, Source(record, after, Candidate(model, 1, terms, evidence, found.p, found.p, found.p, ALPHA))
 
 
 def _own_noise(state: State) -> Array:

@@ -152,7 +152,7 @@ def why(candidate: Candidate, winner: Candidate | None) -> str:
     gain = candidate.assessment.gain
     p = f"p {candidate.adjusted_p:.2g} after correction"
     if candidate.significant and candidate.adjusted_p >= candidate.alpha:
-        p += f" by blocks, {candidate.adjusted_null_p:.2g} in noise of the residual's own colour"
+        p += f" by blocks, {candidate.adjusted_own_p:.2g} in noise of each sensor's own spectrum"
     if happens_once(candidate.model):
         p += " in noise of each sensor's own spectrum"
     figures = f"{p}, held-out gain {gain.total:.4g} (t {gain.t:.2g})"

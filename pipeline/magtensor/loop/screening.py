@@ -38,13 +38,15 @@ def candidates_of(state: State, models: Sequence[Component], failed: dict[str, s
     assessed = _looked_at(state, looked_at, failed)
     found = _one_each(state, assessed)
     adjusted = _holm([a.p * tried for _, tried, _, a in found], len(names))
+    own = _holm([a.own_p * tried for _, tried, _, a in found], len(names))
     null = _holm([a.null_p * tried for _, tried, _, a in found], len(names))
     beside = explained_before(state)
     candidates = [
         Candidate(
-            model, tried, terms, assessment, p, null_p, alpha, _log_noise(state, model, terms, assessment), beside,
+            model, tried, terms, assessment, p, own_p, null_p, alpha, _log_noise(state, model, terms, assessment),
+            beside,
         )
-        for (model, tried, terms, assessment), p, null_p in zip(found, adjusted, null, strict=True)
+        for (model, tried, terms, assessment), p, own_p, null_p in zip(found, adjusted, own, null, strict=True)
     ]  # fmt: skip
     return sorted(candidates, key=lambda c: -c.assessment.gain.total)
 

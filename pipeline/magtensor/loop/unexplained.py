@@ -26,6 +26,7 @@ from magtensor.loop.spectrum import spectral_lines
 from magtensor.loop.stretches import ABOUT
 
 ALPHA = 0.001  # of each of the tests
+OF_A_LINE = 0.1  # of the square of what is left above the noise: less than that says nothing of its cause
 MUCH = 3.0  # times the white noise of an output: no base station beside a site differs by so much unnoticed
 LOUD = 2.0  # times the usual noise
 LEAST_LOUD = 50  # samples
@@ -37,6 +38,8 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
     state = found.last
     excess = excess_rms(state)
     line = strongest_line(state, record)
+    if line is not None and line[1] ** 2 < OF_A_LINE * excess**2:
+        line = None  # where the platform turns steadily, what is no tone has a line too
     last = found.steps[-1].candidates if found.steps else ()
     seen = [c for c in last if c.passes or (c.adjusted_p < c.alpha and c.adjusted_null_p < ALPHA)]
     flagged = lasting(~state.fit.keep, beyond_the_reference(state, record))

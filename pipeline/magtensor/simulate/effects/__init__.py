@@ -18,6 +18,7 @@ from magtensor.simulate.effects.electronics import (
 )
 from magtensor.simulate.effects.geometry import BaselineExpansion, PositionError
 from magtensor.simulate.effects.platform import (
+    AlignmentDrift,
     ChannelResponse,
     Crosstalk,
     CurrentField,
@@ -26,6 +27,7 @@ from magtensor.simulate.effects.platform import (
     LatentSource,
     MovingPart,
     PeriodicInterference,
+    TemperatureAlignment,
     TurnStep,
     ViscousMagnetisation,
 )
@@ -50,6 +52,8 @@ AnyEffect = Annotated[
     | OffsetStep
     | ScaleStep
     | TurnStep
+    | TemperatureAlignment
+    | AlignmentDrift
     | SupplyScale
     | SupplyOffset
     | CurrentField

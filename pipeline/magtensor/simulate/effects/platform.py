@@ -10,6 +10,7 @@ from pydantic import Field, model_validator
 from magtensor.errors import UsageError
 from magtensor.simulate.channels import ChannelSpec, one_channel
 from magtensor.simulate.effects.base import Bench, SensorEffectSpec
+from magtensor.simulate.effects.electronics import LaggingTemperature
 from magtensor.simulate.motion import specific_force
 from magtensor.simulate.processes import low_pass
 from magtensor.simulate.rotations import exponential, matrices, transform, transform_back
@@ -269,6 +270,45 @@ class TurnStep(SensorEffectSpec):
         turned = np.zeros(bench.b.shape)
         turned[after] = transform_back(matrices(exponential(ARCMIN * coefficients)), bench.b[after]) - bench.b[after]
         return bench.sensed(turned)
+
+
+class TemperatureAlignment(LaggingTemperature):
+    """The sensors turn in their mounts as these warm."""
+
+    COEFFICIENTS = "arcmin_per_degC"
+    LINEAR = False
+    type: Literal["temperature_alignment"]
+    arcmin_per_degC: PerSensor | None = Field(
+        None, description="rotation vector in the platform frame, x, y, z, for all sensors or for each"
+    )
+
+    def waveform(self, bench: Bench, coefficients: Array) -> Array:
+        return _turned_by(bench, ARCMIN * coefficients, self.change(bench))
+
+
+class AlignmentDrift(SensorEffectSpec):
+    """The sensors turn slowly in their mounts and come to rest."""
+
+    COEFFICIENTS = "arcmin"
+    LINEAR = False
+    type: Literal["alignment_drift"]
+    arcmin: PerSensor | None = Field(
+        None, description="rotation vector after a long time, in the platform frame, for all sensors or for each"
+    )
+    tau_s: float = Field(3600.0, gt=0, description="time constant, s")
+
+    def waveform(self, bench: Bench, coefficients: Array) -> Array:
+        course = 1.0 - np.exp(-(bench.time - bench.time[0]) / self.tau_s)
+        return _turned_by(bench, ARCMIN * coefficients, np.repeat(course[:, None], bench.sensors, axis=1))
+
+
+def _turned_by(bench: Bench, vectors: Array, course: Array) -> Array:
+    """What sensors read more when each has turned by its vector (S, 3) in rad times a course (N, S)."""
+    turned = np.empty(bench.b.shape)
+    for piece in bench.pieces():
+        rotation = matrices(exponential(vectors * course[piece, :, None]))
+        turned[piece] = transform_back(rotation, bench.b[piece]) - bench.b[piece]
+    return bench.sensed(turned)
 
 
 def _matrices(given: object, sensors: int, what: str) -> Array:
