@@ -8,10 +8,12 @@ import numpy as np
 
 from magtensor.calibration.types import Mask
 from magtensor.loop.model import Record, State, without
+from magtensor.loop.own_noise import OwnNoise
 from magtensor.loop.residual import residual_of
 
 LONGEST_SPIKE = 2  # samples: what lasts longer is no accident of the recording
 UNCOVERED = 2.0  # steps between samples
+FAR = 3.0  # times the rms of slow noise: where it wanders furthest it stays for a while
 
 
 def lasting(bad: Mask, excused: Mask | None = None) -> Mask:
@@ -38,8 +40,9 @@ def beyond_the_reference(state: State, record: Record) -> Mask:
     return out
 
 
-def flagged_words(flagged: Mask, state: State, record: Record) -> str:
-    """How many samples were taken out of use because nothing explains them, when, how large, on which sensors."""
+def flagged_words(flagged: Mask, state: State, record: Record) -> tuple[str, bool]:
+    """How many samples were taken out of use because nothing explains them, when, how large, on which sensors; and
+    whether the slow noise of the sensors goes as far, being no outlier of white noise that it is."""
     raw, reference = without(record, [a.terms(state.excitation) for a in state.adopted], state.theta)
     every = residual_of(replace(state.fit, keep=np.ones(len(flagged), dtype=bool)), raw, reference)
     runs = int(np.sum(np.diff(np.concatenate(([0], flagged.astype(int)))) == 1))
@@ -50,13 +53,19 @@ def flagged_words(flagged: Mask, state: State, record: Record) -> str:
         own = np.mean(every.across[flagged].reshape(int(flagged.sum()), -1, 3) ** 2, axis=(0, 2))
     if every.along is not None and shared > own.max():
         amount = float(np.sqrt(np.mean((every.along[flagged] / every.reference_gain[flagged]) ** 2)))
+        usual = OwnNoise(state.residual, None).slow_along()
         where = " of |b| - F" + ("" if every.across is None else ", in all sensors alike")
     else:
         worst = int(np.argmax(own))
         amount = float(np.sqrt(own[worst] * np.mean(every.noise[3 * worst : 3 * worst + 3] ** 2)))
+        slow = OwnNoise(state.residual, None).slow_std()[3 * worst : 3 * worst + 3]
+        usual = float(np.sqrt(np.mean(slow**2)))
         where = f", mostly on {state.excitation.sensors[worst]}"
     stretches = f"{runs} stretch{'es' * (runs > 1)}"
-    return (
+    words = (
         f"{int(flagged.sum())} samples in {stretches} ({after[0]:.4g} to {after[-1]:.4g} s after the start) fit no "
         f"calibration, by {amount:.3g} nT rms{where}: they are flagged and have no part in the calibration"
     )
+    if amount > FAR * usual:
+        return words, False
+    return f"{words}; slow noise, of {usual:.3g} nT rms there, may go as far", True

@@ -94,6 +94,12 @@ class OwnNoise:
         out: Array = np.repeat(slow, 3) * self.residual.noise
         return out
 
+    def slow_along(self) -> float:
+        """nT rms of the total field that the slow noise of the sensors makes; 0 of a single sensor."""
+        residual = self.residual
+        seen = residual.gain * (self.slow_std() / residual.noise) / residual.reference_gain[:, None]
+        return float(np.sqrt(np.mean(np.sum(seen**2, axis=1))))
+
     def _across_of(self, terms: Terms) -> _Across | None:
         """What terms do across, and what C and o can do."""
         residual = self.residual

@@ -21,6 +21,7 @@ from magtensor.loop.gates import Candidate
 from magtensor.loop.gradient_shape import MODEL, gradient_share
 from magtensor.loop.latent import shared_words
 from magtensor.loop.model import Record, State
+from magtensor.loop.own_noise import OwnNoise
 from magtensor.loop.predictable import attitude_words, converter_words, shortened_words
 from magtensor.loop.spectrum import spectral_lines
 from magtensor.loop.stretches import ABOUT
@@ -28,6 +29,7 @@ from magtensor.loop.stretches import ABOUT
 ALPHA = 0.001  # of each of the tests
 OF_A_LINE = 0.1  # of the square of what is left above the noise: less than that says nothing of its cause
 MUCH = 3.0  # times the white noise of an output: no base station beside a site differs by so much unnoticed
+TWICE = 2.0  # what the slow noise of the sensors, known from few frequencies, makes of it
 LOUD = 2.0  # times the usual noise
 LEAST_LOUD = 50  # samples
 NOISE = "what is left is noise: white, and slow noise of each sensor alone or of the reference"
@@ -55,7 +57,9 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
     words.extend(following or converter_words(state))
     words.extend(shortened_words(state))
     words.extend(one.words for one in changing_matrices(state, ALPHA))
-    if (slow := slow_along(state)) > MUCH * state.residual.scale:
+    if (slow := slow_along(state)) > max(
+        MUCH * state.residual.scale, TWICE * OwnNoise(state.residual, None).slow_along()
+    ):
         words.append(
             f"{slow:.3g} nT rms of |b| - F, in all sensors alike, is no white noise: an error of the base station, or "
             "a field at the site that it does not see"
@@ -75,15 +79,16 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
     if words:
         size = f"{excess:.3g} nT rms above the white noise" if excess else "in sum no more than the white noise"
         words.insert(0, f"{size}, mostly on {_sensors(state)}")
+    beside = loud_words(state, record)
     if flagged.any():
-        words.append(flagged_words(flagged, state, record))
+        left_out, noise = flagged_words(flagged, state, record)
+        (beside if noise else words).append(left_out)
     present = bool(words)
-    loud = loud_words(state, record)
     untested = [MODEL] if shaped and MODEL in found.not_tested else []
     return {
         "present": present,
         "excess_rms_nT": excess,
-        "description": "; ".join([*(words if present else noise_words(state)), *loud]),
+        "description": "; ".join([*(words if present else noise_words(state)), *beside]),
         "looks_like": untested + _looks_like(last) if present else [],
     }
 
