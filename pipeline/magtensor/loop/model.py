@@ -281,6 +281,7 @@ def joint_state(
             fit = _fit(record, raw, reference, how, keep)
             x = beside_the_site(excitation_of(record, fit, raw, lines), adopted, theta)
     entire = residual_of(fit, raw, reference, how.reference_noise)
+    entire = replace(entire, time=record.time[entire.samples])
     residual = quick(entire)
     if adopted:
         terms = joined([a.terms(x) for a in adopted]).at(residual.samples)

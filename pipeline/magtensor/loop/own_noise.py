@@ -1,6 +1,6 @@
 """How unlikely terms are in noise whose spectrum is each sensor's own, whatever its law.
 
-The loop's working colours are one for all sensors, they are laws of frequency, and stationary in each of the residual's
+The loop's working colours are one for all outputs, they are laws of frequency, and stationary in each of the residual's
 two parts. None of that holds where one sensor is worse than the others, or a base station wanders beside the site. What
 is asked here needs none of it: coefficients are linear in the noise of the outputs, so the power of each sensor's noise
 at each frequency, as measured, gives their covariance, the working colours being no more than weights (the sandwich of
@@ -26,6 +26,8 @@ from magtensor.loop.terms import REFERENCE, Terms, joined
 LEAST = 64  # samples, of fewer the noise is taken for white
 OCTAVE = 4  # frequencies in the lowest one
 BAND = 8  # frequencies in the lowest band in which sensors are compared
+MOST_MISSING = 0.25  # of the samples: longer gaps are shortened to that
+ALIKE = 4.0  # values that the axes of one sensor are taken to be alike by
 _SMOOTHING = 8  # rounds in which a course between the middles of octaves gets their levels
 _SCORING = 30  # rounds in which the levels of the sensors are found
 _INNER_RANK = 1e-6  # of the largest singular value
@@ -48,11 +50,12 @@ class OwnNoise:
         """Probability that noise explains as much as terms, at the residual's samples, do beside the given ones.
 
         The levels of the noise are those of all that is left, what the terms explain included, and known from few
-        frequencies where they are slow. So what is explained is compared with what is not, as a share of as many values
-        as the mean of the levels is known from (Satterthwaite 1946): beta-distributed, like the squared multiple
-        correlation.
+        frequencies where they are slow. In one band what is explained is then a share of as many values as the level is
+        known from (Satterthwaite 1946): beta-distributed, like the squared multiple correlation. Where bands of
+        few and of many values come together that share has no bound of one, and would be far too unlikely; chi-square,
+        as if the levels were known, errs to the other side in one band. The larger of both is taken.
         """
-        from scipy.special import betaincc
+        from scipy.special import betaincc, chdtrc
 
         every = terms if self.given is None else joined([self.given, terms])
         across, along = self._across_of(every), self._along_of(every)
@@ -81,8 +84,9 @@ class OwnNoise:
         if freedom <= rank + 1.0:
             return 1.0
         found = seen @ score
-        explained = min(float(found @ inverse @ found) / freedom, 1.0)
-        return float(betaincc(rank / 2.0, (freedom - rank) / 2.0, explained))
+        explained = float(found @ inverse @ found)
+        share_of_all = min(explained / freedom, 1.0)
+        return max(float(betaincc(rank / 2.0, (freedom - rank) / 2.0, share_of_all)), float(chdtrc(rank, explained)))
 
     def slow_std(self) -> Array:
         """(3 S,) nT, rms of the slow noise of each output beside its white noise; 0 of a single sensor."""
@@ -90,8 +94,7 @@ class OwnNoise:
             return np.zeros(len(self.residual.noise))
         each = np.diff(self._edges)
         power = np.repeat(self._levels, each, axis=0) * self._root_across[:, None] ** 2
-        slow = np.sqrt(np.maximum(np.mean(power - power[-1], axis=0), 0.0))
-        out: Array = np.repeat(slow, 3) * self.residual.noise
+        out: Array = np.sqrt(np.maximum(np.mean(power - power[-1], axis=0), 0.0)) * self.residual.noise
         return out
 
     def slow_along(self) -> float:
@@ -113,7 +116,7 @@ class OwnNoise:
         for a in range(own):
             first = terms.count + a * size
             into[count + a, first : first + size] = np.eye(size)
-        series = _frequencies(np.hstack([terms.series, residual.affine])) / self._root_across[:, None]
+        series = _frequencies(self._even(np.hstack([terms.series, residual.affine]))) / self._root_across[:, None]
         series[0] = 0.0
         return _Across(series, into)
 
@@ -121,7 +124,7 @@ class OwnNoise:
         """The columns of terms along the field, whitened, what C and o can do taken off."""
         residual, rows = self.residual, []
         if residual.along is not None:
-            rows.append(_frequencies(along_the_field(residual, [terms]).made) / self._root_along[:, None])
+            rows.append(_frequencies(self._even(along_the_field(residual, [terms]).made)) / self._root_along[:, None])
         if residual.sighted is not None:
             rows.append(across_directions(residual, [terms]).made)
         if not rows:
@@ -146,7 +149,7 @@ class OwnNoise:
         seen: (R, P or more) the scores, as sums of those of the terms, of which the first are `count`.
         """
         residual, edges = self.residual, self._edges
-        n, sensors, each = len(residual.affine), len(residual.noise) // 3, np.diff(edges).astype(float)
+        n, sensors, each = edges[-1], len(residual.noise) // 3, np.diff(edges).astype(float)
         parts, counts, turned = [], [], None
         rows = None if along is None else along.rows @ seen[:, :count].T
         if rows is not None and residual.along is not None:
@@ -156,26 +159,51 @@ class OwnNoise:
         if rows is not None and residual.sighted is not None:
             sighted = rows[-len(residual.sighted.residual) :]
             parts.append((sighted.T @ sighted)[None])
-            counts.append(np.array([2.0 * n]))
+            counts.append(np.array([float(len(residual.sighted.residual))]))
         if residual.across is not None:
             of_output = np.zeros((3 * sensors, n, len(seen)))
             if turned is not None:
-                for o, gain in enumerate(residual.gain.T):
+                for o, gain in enumerate(self._even(residual.gain).T):
                     of_output[o] += _frequencies(turned * gain[:, None]) * self._root_across[:, None]
             if across is not None:
                 for (i, j), weight in zip(pairwise(edges), self._weights, strict=True):
                     through = np.einsum("rk,sko->osr", seen, across.into @ weight, optimize=True)
                     of_output[:, i:j] += across.series[i:j] @ through
-            for sensor, levels in enumerate(self._levels.T):
-                found = sum(_grams(of_output[o], edges) for o in range(3 * sensor, 3 * sensor + 3))
-                parts.append(found * levels[:, None, None])
-                counts.append(each * 3.0 * (sensors - 1) / sensors)
+            for own, levels in zip(of_output, self._levels.T, strict=True):
+                parts.append(_grams(own, edges) * levels[:, None, None])
+                counts.append(each * (sensors - 1) / sensors)
         return np.concatenate(parts), np.concatenate(counts)
+
+    @cached_property
+    def _between(self) -> Array | None:
+        """(M,) numbers of samples, and where some are missing places between two of them; None where none are."""
+        time = self.residual.time
+        if time is None or len(time) < LEAST:
+            return None
+        steps = np.diff(time)
+        missing = np.maximum(np.round(steps / np.median(steps)) - 1.0, 0.0)
+        if not missing.any():
+            return None
+        missing = np.floor(missing * min(1.0, MOST_MISSING * len(time) / missing.sum())).astype(int)
+        places = [i + np.arange(more + 1) / (more + 1) for i, more in enumerate(missing)]
+        return np.concatenate([*places, [len(time) - 1.0]])
+
+    def _even(self, series: Array) -> Array:
+        """(M,) or (M, K): the values (N,) or (N, K) at an even rate, straight lines across gaps.
+
+        Slow noise goes on in a gap, and would seem to have jumped if what comes after it followed at once.
+        """
+        if self._between is None:
+            return series
+        before = np.minimum(self._between.astype(int), len(series) - 2)
+        part = (self._between - before).reshape(-1, *(1,) * (series.ndim - 1))
+        out: Array = series[before] * (1.0 - part) + series[before + 1] * part
+        return out
 
     @cached_property
     def _edges(self) -> NDArray[np.int_]:
         """(B + 1,) frequencies between which the noise of the sensors is compared."""
-        n = len(self.residual.affine)
+        n = len(self._even(self.residual.affine))
         octaves = BAND * 2 ** np.arange(max(int(np.log2(n)), 1))
         return np.concatenate([[0], octaves[octaves < n // 2], [n]])
 
@@ -183,7 +211,7 @@ class OwnNoise:
     def _across(self) -> Array:
         """(N, 3 S) the residual across, over frequency, without its mean."""
         assert self.residual.across is not None
-        out = _frequencies(self.residual.across)
+        out = _frequencies(self._even(self.residual.across))
         out[0] = 0.0
         return out
 
@@ -195,7 +223,7 @@ class OwnNoise:
 
     @cached_property
     def _levels(self) -> Array:
-        """(B, S) power of each sensor's noise over that of all, in each band."""
+        """(B, 3 S) power of each output's noise over that of all, in each band."""
         white = self._across / self._root_across[:, None]
         return np.stack([_levels(white[i:j], self.residual.projector) for i, j in pairwise(self._edges)])
 
@@ -203,14 +231,14 @@ class OwnNoise:
     def _weights(self) -> Array:
         """(B, 3 S, 3 S) inverse covariance across of the sensors' noise in each band."""
         projector = self.residual.projector
-        each = [_inverse(projector * np.repeat(levels, 3) @ projector, 1e-9) for levels in self._levels]
+        each = [_inverse(projector * levels @ projector, 1e-9) for levels in self._levels]
         return np.stack(each)
 
     @cached_property
     def _along(self) -> Array:
         """(N,) the residual along, over frequency."""
         assert self.residual.along is not None
-        return _frequencies(self.residual.along)
+        return _frequencies(self._even(self.residual.along))
 
     @cached_property
     def _root_along(self) -> Array:
@@ -232,7 +260,7 @@ class OwnNoise:
         """(N or more, Q) orthonormal: what C and o can explain of these."""
         residual, rows = self.residual, []
         if residual.along is not None:
-            rows.append(_frequencies(residual.inner) / self._root_along[:, None])
+            rows.append(_frequencies(self._even(residual.inner)) / self._root_along[:, None])
         if residual.sighted is not None:
             rows.append(residual.sighted.inner)
         basis, size, _ = np.linalg.svd(np.concatenate(rows), full_matrices=False)
@@ -245,7 +273,7 @@ class OwnNoise:
         power = self._root_along**2
         if self.residual.across is None:
             return power
-        shown = np.mean(self.residual.gain**2, axis=0).reshape(-1, 3).sum(axis=1)
+        shown = np.mean(self.residual.gain**2, axis=0)
         white = float(shown @ self._levels[-1]) * float(self._root_across[-1] ** 2)
         return np.maximum(power - white, _LEAST_REFERENCE * power)
 
@@ -294,21 +322,32 @@ def smoothed_spectrum(power: Array) -> Array:
 
 
 def _levels(white: Array, projector: Array) -> Array:
-    """(S,) the likeliest power of each sensor's noise in whitened values across (K, 3 S).
+    """(3 S,) the likeliest power of each output's noise in whitened values across (K, 3 S).
 
-    Two sensors have one contrast, which does not tell whose noise it is. Steps of scoring on the logarithms, halved:
-    they keep the levels positive and raise the likelihood.
+    First of each sensor, then of each of its axes, held to that of the sensor as by some values more of the same power.
+    Two sensors have one contrast, which does not tell whose noise it is.
     """
-    sensors = len(projector) // 3
+    outputs, sensors = len(projector), len(projector) // 3
     covariance = white.T @ white / len(white)
     if sensors < 3:
-        return np.full(sensors, float(np.trace(covariance)) / (3 * sensors - 3))
-    levels: Array = np.ones(sensors)
+        return np.full(outputs, float(np.trace(covariance)) / (outputs - 3))
+    of_sensors = _scored(covariance, projector, np.ones(outputs), 3, 1.0)
+    values = len(white) * (sensors - 1) / sensors
+    return _scored(covariance, projector, of_sensors, 1, values / (values + ALIKE))
+
+
+def _scored(covariance: Array, projector: Array, levels: Array, alike: int, weight: float) -> Array:
+    """Levels (3 S,), those of so many neighbours alike, by steps of scoring on the logarithms from those given, which
+    count for the rest of the weight; halved, the steps keep the levels positive and raise the likelihood."""
+    first = levels
     for _ in range(_SCORING):
-        inverse = _inverse(projector * np.repeat(levels, 3) @ projector, 1e-9)
-        seen = np.diagonal(inverse @ covariance @ inverse).reshape(sensors, 3).sum(axis=1)
-        expected = np.diagonal(inverse).reshape(sensors, 3).sum(axis=1)
-        levels = np.asarray(levels * np.sqrt(np.maximum(seen, 1e-12 * expected) / expected))
+        inverse = _inverse(projector * levels @ projector, 1e-9)
+        seen, expected = (
+            np.repeat(np.diagonal(m).reshape(-1, alike).sum(axis=1), alike)
+            for m in (inverse @ covariance @ inverse, inverse)
+        )
+        likeliest = levels * np.sqrt(np.maximum(seen, 1e-12 * expected) / expected)
+        levels = np.asarray(weight * likeliest + (1.0 - weight) * first)
     return levels
 
 

@@ -80,6 +80,7 @@ class Residual:
         samples: (N,) their numbers in the survey.
         slow_modes: how slow noise of the sensors shows along.
         sighted: known directions; levels: unknown constants, which `along` and `inner` have been freed of.
+        time: (N,) s of the samples, where they are of one survey.
     """
 
     across: Array | None
@@ -94,6 +95,7 @@ class Residual:
     slow_modes: SlowModes
     sighted: Sighted | None = None
     levels: Levels | None = None
+    time: Array | None = None
 
     @cached_property
     def gain(self) -> Array:
@@ -163,6 +165,7 @@ class Residual:
             inner=self.inner[keep],
             reference_gain=self.reference_gain[keep],
             samples=self.samples[keep],
+            time=None if self.time is None else self.time[keep],
             slow_modes=SlowModes(self.slow_modes.response[keep]),
         )
 

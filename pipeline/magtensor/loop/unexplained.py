@@ -43,7 +43,9 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
     if line is not None and line[1] ** 2 < OF_A_LINE * excess**2:
         line = None  # where the platform turns steadily, what is no tone has a line too
     last = found.steps[-1].candidates if found.steps else ()
-    seen = [c for c in last if c.passes or (c.adjusted_p < c.alpha and c.adjusted_null_p < ALPHA)]
+    seen = [
+        c for c in last if c.passes or (max(c.adjusted_p, c.adjusted_own_p) < c.alpha and c.adjusted_null_p < ALPHA)
+    ]
     flagged = lasting(~state.fit.keep, beyond_the_reference(state, record))
     if flagged.any():  # while effects were sought, what lasts was believed
         seen = [c for c in seen if _still_significant(c, state)]
@@ -161,7 +163,8 @@ def _still_significant(candidate: Candidate, state: State) -> bool:
     terms = candidate.model.terms(state.excitation).at(state.residual.samples)
     white = Whitened.of(state.residual, state.colours.across, state.colours.along, state.terms)
     now = assess(white, terms, once=happens_once(candidate.model))
-    return now.p * candidate.tried < candidate.alpha and now.null_p * candidate.tried < ALPHA
+    p = max(now.p, now.own_p)
+    return p * candidate.tried < candidate.alpha and now.null_p * candidate.tried < ALPHA
 
 
 def strongest_line(state: State, record: Record) -> tuple[float, float] | None:
