@@ -23,14 +23,19 @@ Ratio = Annotated[float, Field(gt=1, description="times the noise above which th
 Share = Annotated[float, Field(gt=0, lt=1, description="share of the samples")]
 
 
-@metric(needs=("calibrated/b", "total_field"), uses=("calibration/matrix",))
+@metric(needs=("calibrated/b", "total_field"), uses=("calibration/matrix", "residual/total_field"))
 def total_field(survey: Survey, *, warn_ratio: Ratio = 1.5, fail_ratio: Ratio = 30.0) -> list[Verdict]:
     """RMS of |b| - F of each sensor against its noise along the field.
 
-    The noise is that of second differences of the residual: what the fit leaves above it is slower than noise. Where
-    the calibration says that its scale was not measured, |b| is compared after the one scale that fits F best.
+    The noise is that of second differences of the residual: what the fit leaves above it is slower than noise. An error
+    of the base station that was found is taken off F. Where the calibration says that its scale was not measured, |b|
+    is compared after the one scale that fits F best.
     """
     b, reference = survey.values("calibrated/b"), survey.values("total_field")
+    if "residual/total_field" in survey:
+        seen = np.linalg.norm(b, axis=2) - survey.values("residual/total_field")
+        count = np.isfinite(seen).sum(axis=1)
+        reference = np.where(count > 0, np.nansum(seen, axis=1) / np.maximum(count, 1), np.nan)
     known = survey.readings_by_sensor & np.isfinite(reference)[:, None]
     free = any(words.startswith(COMMON_SCALE) for words in left_open(survey))
     if free and known.any():

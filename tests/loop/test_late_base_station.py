@@ -7,8 +7,12 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from loop_cases import scenario, verdict_of
+from loop_cases import RECIPE, scenario, survey_file, verdict_of
 from scipy.signal import lfilter
+
+from magtensor.preparing import empty_survey
+from magtensor.recipe.plan import read_plan
+from magtensor.runner import run
 
 SEARCHED = ["reference_clock", "reference_scale", "reference_drift", "scale_drift"]
 
@@ -109,3 +113,16 @@ def test_a_jump_of_the_base_station_lies_between_its_readings(jump_nT: float, ev
     assert found["coefficients"][0]["value"] == pytest.approx(jump_nT, abs=0.1)
     assert found["settings"]["time_s"] == pytest.approx(700.0, abs=every_s + 1.0)
     assert not told["unexplained"]["present"], told["unexplained"]["description"]
+
+
+def test_what_was_found_of_it_is_no_failure_of_the_calibration(tmp_path: Path) -> None:
+    def late(path: Path) -> None:
+        with h5py.File(path, "a") as file:
+            file["reference/time"][:] = file["reference/time"][:] + 12.0
+
+    path = survey_file(tmp_path, scenario(41))
+    late(path)
+    planned = read_plan(RECIPE, survey=path, overrides=["stages.close_loop.search=[reference_clock]"])
+    survey = run(planned, empty_survey(planned)).survey
+    states = dict(zip(survey.values("qc/metric").tolist(), survey.values("qc/state").tolist(), strict=True))
+    assert [states[f"total_field_rms S{i}"] for i in range(1, 5)] == ["pass"] * 4
