@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
+import h5py
 import numpy as np
 import pytest
-from loop_cases import synthetic
+from loop_cases import scenario, synthetic, verdict_of
 
 from magtensor.loop.contribution import of_all_alike
 from magtensor.loop.model import Adopted, Fitting, joint_state
@@ -32,3 +35,16 @@ def test_one_offset_of_all_sensors_is_a_field_that_drifts() -> None:
     own = joint_state(record, [], Fitting())
     assert state.residual.square() < own.residual.square()
     assert of_all_alike(state, 0)
+
+
+def test_a_base_station_that_follows_the_temperature_is_no_fault_of_the_sensors(tmp_path: Path) -> None:
+    def warmed(path: Path) -> None:
+        with h5py.File(path, "a") as file:
+            warmer = np.interp(file["reference/time"][:], file["time"][:], file["temperature"][:])
+            file["reference/total_field"][:] = file["reference/total_field"][:] + 0.4 * (warmer - warmer.mean())
+
+    told = verdict_of(tmp_path, scenario(23), warmed, ["temperature_scale", "temperature_offset", "channel_response"])
+    assert not told["adopted"]
+    (why,) = (r["why"] for r in told["rejected"] if r["error_model"] == "temperature_scale")
+    assert "an error of the base station that follows temperature would look the same" in why
+    assert told["unexplained"]["present"]

@@ -252,11 +252,10 @@ def _kept(record: Record, before: Trial, chosen: Candidate, how: Fitting) -> tup
     same = [a for a in after.state.adopted[:which] if set(a.sensors or record.sensors) & set(acts_on)]
     if not channels_of(model, after.state.excitation) and already(same, model.component, model.settings):
         return None, "fitted, its settings are those of what is adopted already"
-    if hardly_begun(chosen, after.state.excitation) and of_all_alike(after.state, which):
-        return (
-            None,
-            "fitted, all sensors show it alike, through a lag in which a channel may be any drift of the reference",
-        )
+    slow, channels = hardly_begun(chosen, after.state.excitation), sorted(channels_of(model, after.state.excitation))
+    if (slow or channels) and of_all_alike(after.state, which):
+        drift = "drifts" if slow else f"follows {' and '.join(channels)}"
+        return None, f"fitted, all sensors show it alike: an error of the base station that {drift} would look the same"
     if not agrees(after.state, which):
         return None, "fitted, its coefficients are not what its settings assume"
     if not before.likelier(after):
