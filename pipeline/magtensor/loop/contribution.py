@@ -21,6 +21,7 @@ from magtensor.loop.trial import WORST_RISE
 from magtensor.loop.waveform import NAME
 
 LEAST_FALL = 5e-4  # of the error on held-out blocks, by what lasts: 3 % of the noise is no effect anybody would miss
+APART_ALPHA = 1e-4  # what differs between sensors has to be as unlikely, before an effect of all is not the reference's
 KEEP_ALPHA = 0.01  # an adopted effect that is no longer significant at this level is dropped
 
 
@@ -77,7 +78,7 @@ def of_all_alike(state: State, place: int) -> bool:
     white = Whitened.of(replace(back, along=None), state.colours.across, state.colours.along, others, over_time=False)
     with_it, without = estimated_in(white, mine), estimated_in(white, None)
     gained = explained(with_it) - explained(without)
-    return with_it.rank == without.rank or float(chdtrc(with_it.rank - without.rank, max(gained, 0.0))) > KEEP_ALPHA
+    return with_it.rank == without.rank or float(chdtrc(with_it.rank - without.rank, max(gained, 0.0))) > APART_ALPHA
 
 
 def put_back(residual: Residual, terms: Terms, theta: Array) -> Residual:
