@@ -76,12 +76,14 @@ def hysteresis(
 ) -> Terms:
     """Part of each axis's output hangs behind like gears with play.
 
-    (P_r(m) - m) / r with the play operator P_r run along all samples; the coefficient is half the opening of the
-    loop. It starts without play at the first sample and keeps its state across gaps. Rivals: `sampling_lag` and
+    (P_r(m) - m) / r with the play operator P_r run along all samples, and along the points between them at which the
+    output turns back; the coefficient is half the opening of the loop. It starts without play at the first sample and
+    keeps its state across gaps. Rivals: `sampling_lag` and
     `eddy_current` for swings of equal amplitude and rate.
     """
     m = x.output.reshape(len(x.time), -1)
-    hanging = (_play(m, half_width_nT) - m) / half_width_nT
+    course = x.with_turning_points.reshape(-1, m.shape[1])
+    hanging = (_play(course, half_width_nT)[::2] - m) / half_width_nT
     return x.responses(hanging.reshape(x.output.shape), "nT")
 
 

@@ -148,6 +148,14 @@ def test_cross_field_finds_product_and_difference() -> None:
     np.testing.assert_allclose(per_axis(fit, survey.sensors, "difference "), 0.5 * truth_of(survey), rtol=1e-6)
 
 
+@pytest.mark.parametrize(("rate_Hz", "bound"), [(10.0, 3e-4), (4.0, 2e-3), (2.0, 5e-3)])
+def test_play_knows_where_the_field_turned_back_between_samples(rate_Hz: float, bound: float) -> None:
+    # the play of the samples alone leaves 0.0017, 0.010 and 0.030
+    effect = {"weight": drawn(1e-3), "half_width_nT": [5000.0]}
+    settings, base = {"half_width_nT": 5000.0}, TUMBLING | {"rate_Hz": rate_Hz}
+    assert fitted("hysteresis", settings, effect, base, after_s=START_S)[0].left < bound
+
+
 def test_one_play_operator_takes_most_of_two() -> None:
     # loops of 2000 and 8000 nT: one of the larger width misses the early part of each reversal
     effect = {"weight": drawn(1e-3), "half_width_nT": [2000.0, 8000.0]}

@@ -70,8 +70,8 @@ def body_of(time: Array, command: Array) -> Array:
     return out - 1500.0
 
 
-def settings_found(state: State, motor: int) -> dict[str, Any]:
-    return begun(MODEL, IN_EQUILIBRIUM | {"channel": f"motor_{motor}"}, state, thinned(state, REFINING_SAMPLES))
+def settings_found(state: State, motor: int, samples: int = REFINING_SAMPLES) -> dict[str, Any]:
+    return begun(MODEL, IN_EQUILIBRIUM | {"channel": f"motor_{motor}"}, state, thinned(state, samples))
 
 
 @pytest.mark.parametrize("seed", [300, 305])
@@ -80,7 +80,8 @@ def test_a_drift_is_no_channel_that_began_out_of_equilibrium(seed: int, tmp_path
     assert [settings_found(state, i)["at_start"] for i in range(MOTORS)] == [0.0] * MOTORS
 
 
-def test_a_channel_that_is_heard_and_began_out_of_equilibrium(tmp_path: Path) -> None:
-    found = settings_found(flown(tmp_path, 300, heard=True), 0)
+@pytest.mark.parametrize("samples", [REFINING_SAMPLES, 900])
+def test_a_channel_that_is_heard_and_began_out_of_equilibrium(samples: int, tmp_path: Path) -> None:
+    found = settings_found(flown(tmp_path, 300, heard=True), 0, samples)
     assert found["lag_s"] == pytest.approx(60.0, rel=0.1)
     assert found["at_start"] == pytest.approx(300.0, rel=0.2)

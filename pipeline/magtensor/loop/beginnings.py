@@ -166,7 +166,7 @@ def begun(
     if fair(terms(best)) <= max(fair(terms(settings)), fair(dying)) + least_gain(names):
         return settings
     settled = terms({**best, **dict.fromkeys(names, 0.0)})
-    if generic(Adopted(model, best)) and not _seen_beside(dying, settled, state, few):
+    if generic(Adopted(model, best)) and not _seen_beside(dying, settled, few):
         return settings
     return best
 
@@ -177,11 +177,11 @@ def _refined(gain: Callable[[float], float], lags: Sequence[float]) -> float:
     return golden(gain, lags[max(place - 1, 0)], lags[min(place + 1, len(lags) - 1)], lags[place])
 
 
-def _seen_beside(alone: Terms, settled: Terms, state: State, few: tuple[Residual, Terms | None]) -> bool:
+def _seen_beside(alone: Terms, settled: Terms, few: tuple[Residual, Terms | None]) -> bool:
     """Whether a response in equilibrium shows and predicts held-out blocks beside what dies away."""
     residual, given = few
     beside = alone if given is None else joined([given, alone])
-    colours = likeliest(residual, beside, [state.colours, WHITE]).colours
+    colours = likeliest(residual, beside, [colours_of(residual), WHITE]).colours
     found = assess(Whitened.of(residual, colours.across, colours.along, beside), settled)
     return found.p < _ALONE and found.gain.consistent
 

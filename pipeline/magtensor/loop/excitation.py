@@ -24,6 +24,10 @@ from magtensor.loop.terms import REFERENCE, Terms
 AXES = "xyz"
 VECTORS = ("acceleration", "angular_rate")  # channels with a value for each axis whatever the number of sensors
 SPLINED = 6  # samples, the fewest whose rate of change is that of a spline
+LARGEST_TURN = 0.5  # rad between neighbouring samples above which rates of change mean nothing
+LEAST_IN_A_RUN = 2 * SPLINED - 1  # samples that show a rate of change, and every second of them whether it is right
+WORST_RATE = 0.5  # of the rate of change, moved by leaving out every second sample; with all of them the error of a
+# difference formula is then some tenths of that, where the attitudes are unrelated all of it and more
 
 
 @dataclass(frozen=True)
@@ -303,6 +307,48 @@ class Excitation:
                 out[a:b] = derivative_of(self.time[a:b], series[a:b])
             elif b - a >= 2:
                 out[a:b] = np.gradient(series[a:b], self.time[a:b], axis=0)
+        return out
+
+    @cached_property
+    def turns(self) -> bool:
+        """Whether the field turns, and slowly enough between the samples of a run for its rate to be known."""
+        b = self.field[:, 0]
+        together = np.diff(self.run) == 0
+        long_runs = [(i, j) for i, j in self.runs() if j - i >= LEAST_IN_A_RUN]
+        if not long_runs or not together.any():
+            return False
+        change = np.diff(b, axis=0)[together]
+        typical = np.sqrt(np.mean(np.sum(change**2, axis=1)) / np.mean(np.sum(b**2, axis=1)))
+        rates = [
+            (derivative_of(self.time[i:j], b[i:j])[::2], derivative_of(self.time[i:j:2], b[i:j:2]))
+            for i, j in long_runs
+        ]
+        every, half = (np.concatenate(each) for each in zip(*rates, strict=True))
+        moved = np.sqrt(np.sum((every - half) ** 2) / max(float(np.sum(every**2)), 1e-300))
+        return bool(moved < WORST_RATE and typical < LARGEST_TURN)
+
+    @cached_property
+    def with_turning_points(self) -> Array:
+        """(2 N - 1, S, 3) nT: the outputs, and after each the one at which the field in it turns back before the next.
+
+        Between samples the outputs have the cubic whose values and slopes are theirs. Where it does not turn back, a run
+        ends or the rate is not known the sample itself is there once more.
+        """
+        u = self.output
+        out = np.repeat(u, 2, axis=0)[:-1]
+        if not self.turns:
+            return out
+        slope = self.sensed(self.rate)
+        step = np.diff(self.time)[:, None, None]
+        a, b, rise = slope[:-1] * step, slope[1:] * step, np.diff(u, axis=0)
+        # u + a s + square s^2 + cube s^3, whose slope changes its sign once where a and b differ in theirs
+        square, cube = 3.0 * rise - 2.0 * a - b, a + b - 2.0 * rise
+        larger = -square - np.copysign(np.sqrt(np.maximum(square**2 - 3.0 * cube * a, 0.0)), square)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            one, other = a / larger, larger / (3.0 * cube)
+        s = np.where((one > 0) & (one < 1), one, other)
+        s = np.where((a * b < 0) & (np.diff(self.run) == 0)[:, None, None] & (s > 0) & (s < 1), s, 0.0)
+        out[1::2] += s * (a + s * (square + s * cube))
         return out
 
     @cached_property
