@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from magtensor.accuracy import error_block, figure
@@ -88,8 +90,8 @@ def sentence(outcome: dict[str, Any]) -> str:
     noise = f"; sensor noise {_figure(floor)} nT" if floor is not None else ""
     told = f"{', '.join(figures)} {where}{noise}" if figures else f"no error figure can be given{noise}"
     model = f"the {' and '.join(outcome['declared'])} model" if outcome["declared"] else "no model"
-    adopted = [a["error_model"] for a in outcome["adopted"] if a.get("by") != "person"]
-    by_hand = [a["error_model"] for a in outcome["adopted"] if a.get("by") == "person"]
+    adopted = _named([a for a in outcome["adopted"] if a.get("by") != "person"])
+    by_hand = _named([a for a in outcome["adopted"] if a.get("by") == "person"])
     left = outcome["unexplained"]
     if adopted:
         head = f"The residual was traced to {', '.join(adopted)}"
@@ -106,6 +108,17 @@ def sentence(outcome: dict[str, Any]) -> str:
     tail = f"; unexplained: {left['description']}" if left["present"] else f"; of what is left {slow}" if slow else ""
     doubt = outcome.get("calibration", {}).get("description", "")
     return f"{head}: {told}{tail}{_disagreement(outcome)}{f'; {doubt}' if doubt else ''}."
+
+
+def _named(adopted: Sequence[Mapping[str, Any]]) -> list[str]:
+    """The error models, a response to any channel with that channel, and how often where more than once."""
+    names = [
+        f"{a['error_model']} of {channel}"
+        if a["error_model"] == "channel_response" and (channel := a.get("settings", {}).get("channel"))
+        else str(a["error_model"])
+        for a in adopted
+    ]
+    return [f"{count} x {name}" if count > 1 else name for name, count in Counter(names).items()]
 
 
 def _disagreement(outcome: dict[str, Any]) -> str:

@@ -37,7 +37,7 @@ def frame_flexure(
     *,
     lag_s: Annotated[
         float,
-        Range(0.0, 1.0, count=4, spacing="log"),
+        Range(0.0, 30.0, count=6, spacing="log"),
         Field(ge=0, description="time constant of a frame that gives way late, s"),
     ] = 0.0,
 ) -> Terms:

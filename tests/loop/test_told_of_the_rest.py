@@ -108,3 +108,19 @@ def test_a_line_is_told_where_it_is_much_of_what_is_left(wandering_nT: float, to
     added[:, 2] = wandering_nT * walk / walk.std(axis=0)
     words = str(told(synthetic(4, SAMPLES, turning_s=4.0, noise_nT=0.15, added=added))["description"])
     assert ("a line at 0.137 Hz" in words) is told_of
+
+
+def test_what_was_adopted_more_than_once_is_counted_and_a_channel_named() -> None:
+    blocks = {"total_field_rms_nT": {"all": 1.0}, "tensor_rms_nT_per_m": None}
+    adopted = [
+        {"error_model": name, "settings": {"channel": channel}, "kind": "instrument"}
+        for name, channel in (("offset_step", ""), ("offset_step", ""), ("channel_response", "throttle"))
+    ]
+    outcome = {
+        "declared": ["linear"],
+        "adopted": adopted,
+        "noise_floor_nT": 0.1,
+        "unexplained": {"present": False, "description": "nothing", "excess_rms_nT": 0.0, "looks_like": []},
+        "error": {"fit": blocks, "held_out": {"before": blocks, "after": blocks}},
+    }
+    assert "traced to 2 x offset_step, channel_response of throttle:" in sentence(outcome)

@@ -331,8 +331,8 @@ class Excitation:
     def with_turning_points(self) -> Array:
         """(2 N - 1, S, 3) nT: the outputs, and after each the one at which the field in it turns back before the next.
 
-        Between samples the outputs have the cubic whose values and slopes are theirs. Where it does not turn back, a run
-        ends or the rate is not known the sample itself is there once more.
+        Between samples the outputs have the cubic whose values and slopes are theirs. Where it does not turn back, or
+        a run ends, or the rate is not known, the sample itself is there once more.
         """
         u = self.output
         out = np.repeat(u, 2, axis=0)[:-1]
