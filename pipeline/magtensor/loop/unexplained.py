@@ -19,6 +19,7 @@ from magtensor.loop.flagged import beyond_the_reference, flagged_words, lasting
 from magtensor.loop.found import Search
 from magtensor.loop.gates import Candidate
 from magtensor.loop.gradient_shape import MODEL, gradient_share
+from magtensor.loop.jitter import jitter_words
 from magtensor.loop.latent import shared_words
 from magtensor.loop.model import Record, State
 from magtensor.loop.own_noise import OwnNoise
@@ -58,6 +59,7 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
     following = attitude_words(state)
     words.extend(following or converter_words(state))
     words.extend(shortened_words(state))
+    words.extend(jitter_words(state))
     words.extend(one.words for one in changing_matrices(state, ALPHA))
     if (slow := slow_along(state)) > max(
         MUCH * state.residual.scale, TWICE * OwnNoise(state.residual, None).slow_along()
@@ -79,8 +81,8 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
             + (f": {MODEL}, which cannot be tested without {lacks}, would look like this" if lacks else "")
         )
     if words:
-        size = f"{excess:.3g} nT rms above the white noise" if excess else "in sum no more than the white noise"
-        words.insert(0, f"{size}, mostly on {_sensors(state)}")
+        size = f"{excess:.3g} nT rms above the white noise, {_on_sensors(state)}"
+        words.insert(0, size if excess else "in sum no more than the white noise")
     beside = loud_words(state, record)
     if flagged.any():
         left_out, noise = flagged_words(flagged, state, record)
@@ -102,7 +104,7 @@ def noise_words(state: State) -> list[str]:
         values = len(residual.across) * (residual.freedom - (residual.along is not None))
         slow = white * max(float(np.sum(residual.across**2)) / values - 1.0, 0.0) ** 0.5
         if slow > white:
-            words.append(f"{slow:.3g} nT rms is not white, mostly on {_sensors(state)}")
+            words.append(f"{slow:.3g} nT rms is not white, {_on_sensors(state)}")
     if (slow := slow_along(state)) > white:
         words.append(f"{slow:.3g} nT rms of |b| - F is not white")
     return words
@@ -173,14 +175,17 @@ def strongest_line(state: State, record: Record) -> tuple[float, float] | None:
     return (lines[0][0], lines[0][1]) if lines and lines[0][2] < ALPHA else None
 
 
-def _sensors(state: State) -> str:
+def _on_sensors(state: State) -> str:
+    """Words for the sensors that hold most of what is left."""
     across = state.residual.across
     if across is None:
-        return ", ".join(state.excitation.sensors)
+        return f"on {', '.join(state.excitation.sensors)}"
     each = np.mean(across.reshape(len(across), -1, 3) ** 2, axis=(0, 2))
     order = np.argsort(-each)
     top = [i for i in order if each[i] > 0.7 * each[order[0]]]
-    return "all sensors" if len(top) == len(each) else ", ".join(state.excitation.sensors[i] for i in sorted(top))
+    if len(top) == len(each):
+        return "on all sensors"
+    return f"mostly on {', '.join(state.excitation.sensors[i] for i in sorted(top))}"
 
 
 def _looks_like(candidates: Sequence[Candidate]) -> list[str]:

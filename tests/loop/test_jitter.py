@@ -1,0 +1,35 @@
+"""A sensor whose samples are taken early or late at random: no regressor follows it, and it is told."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+from loop_cases import linear_state, loaded, scenario
+
+from magtensor.loop.jitter import jitter_words
+
+EFFECTS: dict[str, list[dict[str, Any]]] = {
+    "clean": [],
+    "a delay": [{"type": "sampling_lag", "rms_nT": 0.5}],
+    "a loop": [{"type": "hysteresis", "half_width_nT": [5000.0], "rms_nT": 0.5}],
+    "a temperature": [{"type": "temperature_offset", "rms_nT": 2.0}],
+}
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_it_is_found_with_its_size(seed: int, tmp_path: Path) -> None:
+    effect = {"type": "jitter", "rms_nT": 0.3, "sensors": ["S2"]}
+    (words,) = jitter_words(linear_state(loaded(tmp_path, scenario(seed, effect))))
+    found = re.fullmatch(r"the noise of (S\d) grows .* by ([\d.]+) nT rms, .* by ([\d.]+) ms at random", words)
+    assert found is not None and found[1] == "S2"
+    # of 1000 samples the square is known to some per cent, and the others' spline cuts some of the rate
+    assert float(found[2]) == pytest.approx(0.3, rel=0.15)
+
+
+@pytest.mark.parametrize("what", EFFECTS)
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_nothing_else_is_taken_for_it(what: str, seed: int, tmp_path: Path) -> None:
+    assert jitter_words(linear_state(loaded(tmp_path, scenario(seed, *EFFECTS[what])))) == []
