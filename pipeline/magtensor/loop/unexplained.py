@@ -69,8 +69,10 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
             "a field at the site that it does not see"
         )
     gradient = gradient_share(state, record.position)
+    refused = found.steps[-1].refused if found.steps else {}
     if open_ := [c.model.name for c in suspects if c.passes]:
-        words.append(f"significant, passes the first two gates of the loop and is not adopted: {', '.join(open_)}")
+        named = [f"{name} ({refused[name]})" if name in refused else name for name in open_]
+        words.append(f"significant, passes the first two gates of the loop and is not adopted: {', '.join(named)}")
     if useless := [c.model.name for c in suspects if not c.passes]:
         words.append(f"significant but of no use on held-out blocks: {', '.join(useless)}")
     shaped = bool(words) and gradient > 0
