@@ -6,7 +6,8 @@ import numpy as np
 from pydantic import Field
 
 from magtensor.components import error_model
-from magtensor.loop.excitation import AXES, Excitation
+from magtensor.loop.acting import AXES
+from magtensor.loop.excitation import Excitation
 from magtensor.loop.settings import AnyChannel, Choice, Frequencies, Range
 from magtensor.loop.terms import Terms, joined
 from magtensor.units import convert

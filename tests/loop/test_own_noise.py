@@ -167,7 +167,7 @@ def test_slow_noise_goes_on_in_a_gap() -> None:
     """Half an hour is missing while an axis walks on: no jump that its own spectrum could not make."""
     offset_step = Registry.load().find("error_model", "offset_step")
     p = []
-    for seed in range(6):
+    for seed in range(200, 206):
         record = synthetic(seed, SAMPLES, turning_s=4.0, noise_nT=0.15, added=noisy(seed, {2: 3.0}, 3000.0, 1, 2))
         here = np.flatnonzero((np.arange(SAMPLES) < 700) | (np.arange(SAMPLES) >= 1000))
         assert record.total_field is not None and record.quiet_field is not None
@@ -179,5 +179,5 @@ def test_slow_noise_goes_on_in_a_gap() -> None:
         terms = offset_step.function(state.excitation, time_s=850.0).at(state.residual.samples)
         p.append([OwnNoise(r, None).p_value(terms) for r in (state.residual, replace(state.residual, time=None))])
     over_time, as_if_no_gap = np.array(p).T
-    assert over_time.min() > 1e-4
+    assert over_time.min() > 1e-3
     assert as_if_no_gap.min() < 1e-6

@@ -14,9 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from magtensor.calibration.types import Array
+from magtensor.loop.acting import AXES
 from magtensor.loop.assessment import WHITE, Colours
 from magtensor.loop.evidence import Whitened, grams_in
-from magtensor.loop.excitation import AXES, Excitation
+from magtensor.loop.excitation import Excitation
 from magtensor.loop.model import State
 from magtensor.loop.residual import Residual
 from magtensor.loop.separation import SEPARATION

@@ -1,4 +1,4 @@
-"""What an error model may look at: time, field, channels; and the few ways in which effects act on sensors."""
+"""What an error model may look at: time, field, channels."""
 
 from __future__ import annotations
 
@@ -15,23 +15,17 @@ from magtensor.attitude import into_platform_frame, to_world
 from magtensor.calibration.by_sensor import by_sensor
 from magtensor.calibration.types import Array
 from magtensor.errors import DataError, did_you_mean
-from magtensor.loop import first_order
+from magtensor.loop import first_order, rates
+from magtensor.loop.acting import Acting
 from magtensor.loop.delays import contiguous
 from magtensor.loop.held_logs import unheld
 from magtensor.loop.station import Station
-from magtensor.loop.terms import REFERENCE, Terms
 
-AXES = "xyz"
 VECTORS = ("acceleration", "angular_rate")  # channels with a value for each axis whatever the number of sensors
-SPLINED = 6  # samples, the fewest whose rate of change is that of a spline
-LARGEST_TURN = 0.5  # rad between neighbouring samples above which rates of change mean nothing
-LEAST_IN_A_RUN = 2 * SPLINED - 1  # samples that show a rate of change, and every second of them whether it is right
-WORST_RATE = 0.5  # of the rate of change, moved by leaving out every second sample; with all of them the error of a
-# difference formula is then some tenths of that, where the attitudes are unrelated all of it and more
 
 
 @dataclass(frozen=True)
-class Excitation:
+class Excitation(Acting):
     """A survey as error models see it.
 
     Attributes:
@@ -295,194 +289,37 @@ class Excitation:
             return series
         out = np.array(series, dtype=float)
         for a, b in self.runs():
-            response = first_order.smooth if b - a >= SPLINED else first_order.straight
+            response = first_order.smooth if b - a >= rates.SPLINED else first_order.straight
             out[a:b] = response(self.time[a:b], out[a:b], tau)
         return out
 
     def derivative(self, series: Array) -> Array:
         """d/dt of a series (N, ...), 1/s, within each run; zero where a run is a single sample."""
-        out = np.zeros_like(np.asarray(series, dtype=float))
-        for a, b in self.runs():
-            if b - a >= SPLINED:
-                out[a:b] = derivative_of(self.time[a:b], series[a:b])
-            elif b - a >= 2:
-                out[a:b] = np.gradient(series[a:b], self.time[a:b], axis=0)
-        return out
+        return rates.derivative(self.time, self.runs(), series)
 
     @cached_property
     def turns(self) -> bool:
         """Whether the field turns, and slowly enough between the samples of a run for its rate to be known."""
-        b = self.field[:, 0]
-        together = np.diff(self.run) == 0
-        long_runs = [(i, j) for i, j in self.runs() if j - i >= LEAST_IN_A_RUN]
-        if not long_runs or not together.any():
-            return False
-        change = np.diff(b, axis=0)[together]
-        typical = np.sqrt(np.mean(np.sum(change**2, axis=1)) / np.mean(np.sum(b**2, axis=1)))
-        rates = [
-            (derivative_of(self.time[i:j], b[i:j])[::2], derivative_of(self.time[i:j:2], b[i:j:2]))
-            for i, j in long_runs
-        ]
-        every, half = (np.concatenate(each) for each in zip(*rates, strict=True))
-        moved = np.sqrt(np.sum((every - half) ** 2) / max(float(np.sum(every**2)), 1e-300))
-        return bool(moved < WORST_RATE and typical < LARGEST_TURN)
-
-    @cached_property
-    def with_turning_points(self) -> Array:
-        """(2 N - 1, S, 3) nT: the outputs, and after each the one at which the field in it turns back before the next.
-
-        Between samples the outputs have the cubic whose values and slopes are theirs. Where it does not turn back, or
-        a run ends, or the rate is not known, the sample itself is there once more.
-        """
-        u = self.output
-        out = np.repeat(u, 2, axis=0)[:-1]
-        if not self.turns:
-            return out
-        slope = self.sensed(self.rate)
-        step = np.diff(self.time)[:, None, None]
-        a, b, rise = slope[:-1] * step, slope[1:] * step, np.diff(u, axis=0)
-        # u + a s + square s^2 + cube s^3, whose slope changes its sign once where a and b differ in theirs
-        square, cube = 3.0 * rise - 2.0 * a - b, a + b - 2.0 * rise
-        larger = -square - np.copysign(np.sqrt(np.maximum(square**2 - 3.0 * cube * a, 0.0)), square)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            one, other = a / larger, larger / (3.0 * cube)
-        s = np.where((one > 0) & (one < 1), one, other)
-        s = np.where((a * b < 0) & (np.diff(self.run) == 0)[:, None, None] & (s > 0) & (s < 1), s, 0.0)
-        out[1::2] += s * (a + s * (square + s * cube))
-        return out
+        return rates.rate_known(self.time, self.runs(), self.field[:, 0])
 
     @cached_property
     def rate(self) -> Array:
-        """dB/dt (N, 3) nT/s where all sensors see one field, else (N, S, 3).
-
-        Differences between samples cut the corners of a turning field and shorten it; the part along the field is
-        that of its length, which changes slowly. Otherwise a total field would seem to show a delay of all sensors.
-        """
-        b = self.field_or_fields
-        length = np.linalg.norm(b, axis=-1, keepdims=True)
-        along = b / length
-        change = self.derivative(b)
-        own = np.sum(along * change, axis=-1, keepdims=True)
-        out: Array = change + along * (self.derivative(length) - own)
-        return out
+        """dB/dt (N, 3) nT/s where all sensors see one field, else (N, S, 3)."""
+        return rates.turning(self.time, self.runs(), self.field_or_fields)
 
     @cached_property
     def curvature(self) -> Array:
-        """d2B/dt2 (N, 3) nT/s2 where all sensors see one field, else (N, S, 3).
+        """d2B/dt2 (N, 3) nT/s2 where all sensors see one field, else (N, S, 3)."""
+        return rates.curvature(self.time, self.runs(), self.field_or_fields, self.rate)
 
-        Across the field from differences over two samples to either side, in which noise is a quarter of that between
-        neighbours; along it what turning makes of a length that changes slowly, -|dB/dt|^2 / |B|. Zero in runs of fewer
-        than five samples; the two at each end have that of the third.
-        """
-        b = self.field_or_fields
-        length = np.linalg.norm(b, axis=-1, keepdims=True)
-        along = b / length
-        change = np.zeros_like(b)
-        for first, end in self.runs():
-            if end - first < 5:
-                continue
-            inner = change[first + 2 : end - 2]
-            t, v = self.time[first:end], b[first:end]
-            shape = (-1, *[1] * (b.ndim - 1))
-            before, after = (t[2:-2] - t[:-4]).reshape(shape), (t[4:] - t[2:-2]).reshape(shape)
-            inner[...] = 2.0 * ((v[4:] - v[2:-2]) / after - (v[2:-2] - v[:-4]) / before) / (before + after)
-            change[first : first + 2], change[end - 2 : end] = inner[0], inner[-1]
-        own = np.sum(along * change, axis=-1, keepdims=True)
-        turning = np.sum(self.rate**2, axis=-1, keepdims=True) / length
-        out: Array = change - along * (own + turning)
-        return out
+    @cached_property
+    def with_turning_points(self) -> Array:
+        """(2 N - 1, S, 3) nT: the outputs, and after each the one at which the field in it turns back before the next;
+        the sample itself once more where it does not, or where the rate is not known."""
+        if not self.turns:
+            return np.repeat(self.output, 2, axis=0)[:-1]
+        return rates.with_turning_points(self.time, self.runs(), self.output, self.sensed(self.rate))
 
     def runs(self) -> list[tuple[int, int]]:
         """(first, one past last) sample of each contiguous run."""
         return contiguous(self.run)
-
-    # The ways in which effects act.
-
-    def offsets(self, series: Array, units: str, name: str = "") -> Terms:
-        """A series (N,), or one for each sensor (N, S), added to every axis: one coefficient an axis."""
-        columns = np.asarray(series, dtype=float).reshape(len(self.time), -1)
-        shared = columns.shape[1] == 1
-        outputs = np.arange(3 * len(self.sensors))
-        return self._single(columns, outputs, np.zeros_like(outputs) if shared else outputs // 3, units, name)
-
-    def driving(self, of_field: bool) -> Array:
-        """(N, S, 3) nT: the outputs, or what is in them of the field, without the offsets.
-
-        A feedback resistor that warms scales the field and the hard iron; the offset of the electronics comes after it.
-        """
-        return self.sensed(self.field) if of_field else self.output
-
-    def scales(self, series: Array, units: str, name: str = "", *, of_field: bool = False) -> Terms:
-        """A series (N,) or (N, S) times the axis's own output, or the field in it: one coefficient an axis."""
-        factor = np.asarray(series, dtype=float).reshape(len(self.time), -1, 1)
-        return self.responses(self.driving(of_field) * factor, units, name)
-
-    def responses(self, series: Array, units: str, name: str = "") -> Terms:
-        """A series for each axis of each sensor, (N, S, 3): one coefficient an axis."""
-        columns = np.asarray(series, dtype=float).reshape(len(self.time), -1)
-        outputs = np.arange(columns.shape[1])
-        return self._single(columns, outputs, outputs, units, name)
-
-    def matrices(self, series: Array, units: str) -> Terms:
-        """A vector (N, 3), or one for each sensor (N, S, 3), that reaches every axis through a matrix: nine each."""
-        s = len(self.sensors)
-        values = np.asarray(series, dtype=float)
-        shared = values.ndim == 2
-        columns = values.reshape(len(self.time), -1)
-        outputs = np.repeat(np.arange(3 * s), 3)
-        component = np.tile(np.arange(3), 3 * s)
-        index = component if shared else 3 * (outputs // 3) + component
-        names = tuple(AXES[o % 3] + AXES[c] for o, c in zip(outputs, component, strict=True))
-        return Terms(
-            names, tuple(self.sensors[o // 3] for o in outputs), (units,) * len(names), columns,
-            np.arange(len(names)), outputs, index,
-        )  # fmt: skip
-
-    def one_each(self, series: Array, units: str, name: str) -> Terms:
-        """A vector for each sensor (N, S, 3) with one coefficient a sensor."""
-        s = len(self.sensors)
-        columns = np.asarray(series, dtype=float).reshape(len(self.time), -1)
-        outputs = np.arange(3 * s)
-        return Terms((name,) * s, self.sensors, (units,) * s, columns, outputs // 3, outputs, outputs)
-
-    def late(self, course: Array, units: str, name: str, *, per_axis: bool = False) -> Terms:
-        """Outputs late by a coefficient times a course (N,), s: one coefficient a sensor, or one an axis."""
-        series = -np.asarray(course, dtype=float)[:, None, None] * self.sensed(self.rate)
-        terms = self.responses(series, units, f"{name} ") if per_axis else self.one_each(series, units, name)
-        return replace(terms, delay=np.repeat(course[:, None], terms.series.shape[1], axis=1))
-
-    def shared(self, series: Array, units: str, name: str) -> Terms:
-        """One coefficient for a pattern (N, S, 3) over all sensors."""
-        columns = np.asarray(series, dtype=float).reshape(len(self.time), -1)
-        outputs = np.arange(columns.shape[1])
-        return Terms((name,), ("",), (units,), columns, np.zeros_like(outputs), outputs, outputs)
-
-    def on_reference(self, series: Array, units: str, name: str) -> Terms:
-        """One coefficient for a series (N,) that the reference total field holds."""
-        columns, index = np.asarray(series, dtype=float)[:, None], np.zeros(1, dtype=int)
-        return Terms((name,), ("",), (units,), columns, index, index + REFERENCE, index)
-
-    def _single(
-        self, columns: Array, outputs: NDArray[np.int_], index: NDArray[np.int_], units: str, name: str
-    ) -> Terms:
-        return Terms(
-            tuple(f"{name}{AXES[o % 3]}" for o in outputs),
-            tuple(self.sensors[o // 3] for o in outputs),
-            (units,) * len(outputs),
-            columns,
-            np.arange(len(outputs)),
-            outputs,
-            index,
-        )
-
-
-def derivative_of(time: Array, series: Array) -> Array:
-    """d/dt of a series (N, ...) of `SPLINED` samples or more, by a spline of the fifth degree through them.
-
-    Off by half a per cent for a turn of a right angle from one sample to the next, where central differences of fourth
-    order lose 15.
-    """
-    from scipy.interpolate import make_interp_spline
-
-    found: Array = make_interp_spline(time, series, k=SPLINED - 1)(time, 1)
-    return found

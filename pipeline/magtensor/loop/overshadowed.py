@@ -17,12 +17,12 @@ import numpy as np
 
 from magtensor.calibration.types import Array
 from magtensor.loop.assessment import estimated
-from magtensor.loop.contribution import removal, slices
+from magtensor.loop.contribution import happens_once, removal, slices
 from magtensor.loop.direction import attitude_series, turning_Hz
 from magtensor.loop.found import Search
 from magtensor.loop.model import Adopted, State
 from magtensor.loop.residual import taken_off
-from magtensor.loop.settings import EventTimes, Frequencies, profiled
+from magtensor.loop.settings import Frequencies, profiled
 from magtensor.loop.terms import joined
 from magtensor.loop.unexplained import unexplained
 from magtensor.loop.waveform import NAME
@@ -79,8 +79,7 @@ def _part_of_a_source(found: Search, fixed: int) -> tuple[list[int], str] | None
         return None
     amount = float(np.sqrt(np.mean(shared.direction**2)))
     for place, model in enumerate(state.adopted):
-        once = any(isinstance(grid, EventTimes) for grid in profiled(model.component).values())
-        if place < fixed or not once:
+        if place < fixed or not happens_once(model):
             continue
         assert state.terms is not None
         theta = np.zeros(state.terms.count)

@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from magtensor.calibration.types import Array
+from magtensor.loop.acting import AXES
 from magtensor.loop.assessment import WHITE, Colours, block_count
 from magtensor.loop.direction import attitude_series, direction_series
-from magtensor.loop.excitation import AXES, Excitation
+from magtensor.loop.excitation import Excitation
 from magtensor.loop.model import State
 from magtensor.loop.statistics import FOLDS, Gain, held_out_gain
 from magtensor.loop.terms import Terms, joined

@@ -40,9 +40,6 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
     """The `unexplained` block of the contract."""
     state = found.last
     excess = excess_rms(state)
-    line = strongest_line(state, record)
-    if line is not None and line[1] ** 2 < OF_A_LINE * excess**2:
-        line = None  # where the platform turns steadily, what is no tone has a line too
     last = found.steps[-1].candidates if found.steps else ()
     seen = [
         c for c in last if c.passes or (max(c.adjusted_p, c.adjusted_own_p) < c.alpha and c.adjusted_null_p < ALPHA)
@@ -54,16 +51,17 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
     words: list[str] = []
     if found.shared is not None and found.shared.significant:
         words.append(shared_words(found.shared, record.sensors))
-    if line is not None:
+    line = strongest_line(state, record)
+    # where the platform turns steadily, what is no tone has a small line too
+    if line is not None and line[1] ** 2 >= OF_A_LINE * excess**2:
         words.append(f"a line at {line[0]:.4g} Hz (period {1 / line[0]:.4g} s), {line[1]:.3g} nT rms")
     following = attitude_words(state)
     words.extend(following or converter_words(state))
     words.extend(shortened_words(state))
     words.extend(jitter_words(state))
     words.extend(one.words for one in changing_matrices(state, ALPHA))
-    if (slow := slow_along(state)) > max(
-        MUCH * state.residual.scale, TWICE * OwnNoise(state.residual, None).slow_along()
-    ):
+    of_sensors = OwnNoise(state.residual, None).slow_along()
+    if (slow := slow_along(state)) > max(MUCH * state.residual.scale, TWICE * of_sensors):
         words.append(
             f"{slow:.3g} nT rms of |b| - F, in all sensors alike, is no white noise: an error of the base station, or "
             "a field at the site that it does not see"

@@ -266,10 +266,8 @@ class TurnStep(SensorEffectSpec):
     time_s: float = Field(description="time of the knock, s since the start")
 
     def waveform(self, bench: Bench, coefficients: Array) -> Array:
-        after = bench.time >= self.time_s
-        turned = np.zeros(bench.b.shape)
-        turned[after] = transform_back(matrices(exponential(ARCMIN * coefficients)), bench.b[after]) - bench.b[after]
-        return bench.sensed(turned)
+        after = (bench.time >= self.time_s).astype(float)
+        return _turned_by(bench, ARCMIN * coefficients, after[:, None])
 
 
 class TemperatureAlignment(LaggingTemperature):
@@ -299,11 +297,11 @@ class AlignmentDrift(SensorEffectSpec):
 
     def waveform(self, bench: Bench, coefficients: Array) -> Array:
         course = 1.0 - np.exp(-(bench.time - bench.time[0]) / self.tau_s)
-        return _turned_by(bench, ARCMIN * coefficients, np.repeat(course[:, None], bench.sensors, axis=1))
+        return _turned_by(bench, ARCMIN * coefficients, course[:, None])
 
 
 def _turned_by(bench: Bench, vectors: Array, course: Array) -> Array:
-    """What sensors read more when each has turned by its vector (S, 3) in rad times a course (N, S)."""
+    """What sensors read more when each has turned by its vector (S, 3) in rad times a course, (N, S) or (N, 1)."""
     turned = np.empty(bench.b.shape)
     for piece in bench.pieces():
         rotation = matrices(exponential(vectors * course[piece, :, None]))

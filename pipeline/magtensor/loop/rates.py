@@ -1,0 +1,118 @@
+"""How series that turn with the platform change within and between samples: rates, second derivatives, turning points.
+
+A run is a contiguous stretch of samples; nothing is known of what happens between two of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from magtensor.calibration.types import Array
+
+Runs = Sequence[tuple[int, int]]  # (first, one past last) sample of each
+
+SPLINED = 6  # samples, the fewest whose rate of change is that of a spline
+LARGEST_TURN = 0.5  # rad between neighbouring samples above which rates of change mean nothing
+LEAST_IN_A_RUN = 2 * SPLINED - 1  # samples that show a rate of change, and every second of them whether it is right
+WORST_RATE = 0.5  # of the rate of change, moved by leaving out every second sample; with all of them the error of a
+# difference formula is then some tenths of that, where the attitudes are unrelated all of it and more
+
+
+def derivative(time: Array, runs: Runs, series: Array) -> Array:
+    """d/dt of a series (N, ...), 1/s, within each run; zero where a run is a single sample."""
+    out = np.zeros_like(np.asarray(series, dtype=float))
+    for a, b in runs:
+        if b - a >= SPLINED:
+            out[a:b] = _of_a_spline(time[a:b], series[a:b])
+        elif b - a >= 2:
+            out[a:b] = np.gradient(series[a:b], time[a:b], axis=0)
+    return out
+
+
+def rate_known(time: Array, runs: Runs, vectors: Array) -> bool:
+    """Whether vectors (N, 3) turn, and slowly enough between the samples of a run for their rate to be known."""
+    change = np.concatenate([np.diff(vectors[i:j], axis=0) for i, j in runs])
+    long_runs = [(i, j) for i, j in runs if j - i >= LEAST_IN_A_RUN]
+    if not long_runs or not len(change):
+        return False
+    typical = np.sqrt(np.mean(np.sum(change**2, axis=1)) / np.mean(np.sum(vectors**2, axis=1)))
+    rates = [
+        (_of_a_spline(time[i:j], vectors[i:j])[::2], _of_a_spline(time[i:j:2], vectors[i:j:2])) for i, j in long_runs
+    ]
+    every, half = (np.concatenate(each) for each in zip(*rates, strict=True))
+    moved = np.sqrt(np.sum((every - half) ** 2) / max(float(np.sum(every**2)), 1e-300))
+    return bool(moved < WORST_RATE and typical < LARGEST_TURN)
+
+
+def turning(time: Array, runs: Runs, vectors: Array) -> Array:
+    """d/dt of vectors (N, ..., 3) that turn, 1/s.
+
+    Differences between samples cut the corners of a vector that turns and shorten it; the part along it is that of its
+    length, which changes slowly. Otherwise a total field would seem to show a delay of all sensors.
+    """
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    along = vectors / length
+    change = derivative(time, runs, vectors)
+    own = np.sum(along * change, axis=-1, keepdims=True)
+    out: Array = change + along * (derivative(time, runs, length) - own)
+    return out
+
+
+def curvature(time: Array, runs: Runs, vectors: Array, rate: Array) -> Array:
+    """d2/dt2 of vectors (N, ..., 3) that turn, 1/s2, their rate being known.
+
+    Across them from differences over two samples to either side, in which noise is a quarter of that between
+    neighbours; along them what turning makes of a length that changes slowly, minus the squared rate over the length.
+    Zero in runs of fewer than five samples; the two at each end have that of the third.
+    """
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    along = vectors / length
+    change = np.zeros_like(vectors)
+    for first, end in runs:
+        if end - first < 5:
+            continue
+        inner = change[first + 2 : end - 2]
+        t, v = time[first:end], vectors[first:end]
+        shape = (-1, *[1] * (vectors.ndim - 1))
+        before, after = (t[2:-2] - t[:-4]).reshape(shape), (t[4:] - t[2:-2]).reshape(shape)
+        inner[...] = 2.0 * ((v[4:] - v[2:-2]) / after - (v[2:-2] - v[:-4]) / before) / (before + after)
+        change[first : first + 2], change[end - 2 : end] = inner[0], inner[-1]
+    own = np.sum(along * change, axis=-1, keepdims=True)
+    out: Array = change - along * (own + np.sum(rate**2, axis=-1, keepdims=True) / length)
+    return out
+
+
+def with_turning_points(time: Array, runs: Runs, series: Array, rate: Array) -> Array:
+    """(2 N - 1, ...): a series (N, ...), and after each value the one at which it turns back before the next.
+
+    Between samples it has the cubic whose values and rates (N, ...) are given. Where it does not turn back, or a run
+    ends, the value itself is there once more.
+    """
+    out = np.repeat(series, 2, axis=0)[:-1]
+    for first, end in runs:
+        step = np.diff(time[first:end]).reshape(-1, *[1] * (series.ndim - 1))
+        a, b = rate[first : end - 1] * step, rate[first + 1 : end] * step
+        rise = np.diff(series[first:end], axis=0)
+        # the value and a s + square s^2 + cube s^3: its slope changes sign once where a and b differ in theirs
+        square, cube = 3.0 * rise - 2.0 * a - b, a + b - 2.0 * rise
+        larger = -square - np.copysign(np.sqrt(np.maximum(square**2 - 3.0 * cube * a, 0.0)), square)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            one, other = a / larger, larger / (3.0 * cube)
+        s = np.where((one > 0) & (one < 1), one, other)
+        s = np.where((a * b < 0) & (s > 0) & (s < 1), s, 0.0)
+        out[2 * first + 1 : 2 * end - 2 : 2] += s * (a + s * (square + s * cube))
+    return out
+
+
+def _of_a_spline(time: Array, series: Array) -> Array:
+    """d/dt of a series (N, ...) of `SPLINED` samples or more, by a spline of the fifth degree through them.
+
+    Off by half a per cent for a turn of a right angle from one sample to the next, where central differences of fourth
+    order lose 15.
+    """
+    from scipy.interpolate import make_interp_spline
+
+    found: Array = make_interp_spline(time, series, k=SPLINED - 1)(time, 1)
+    return found
