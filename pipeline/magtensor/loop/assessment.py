@@ -55,7 +55,7 @@ def _along(residual: Residual, along: Array, across: Colour, stiff: bool) -> Col
         excess, share = excess_of(across, modes.most), across.white / plain.white
     if not len(excess):
         return plain
-    turned = TurnedColour(modes, np.repeat(excess * share, 3), Colour(None, 1.0))
+    turned = TurnedColour(modes.slowest(len(excess)), np.repeat(excess * share, 3), Colour(None, 1.0))
     return replace(turned, rest=colour_of(turned.still(along)[:, None], stiff=stiff))
 
 
@@ -96,7 +96,7 @@ def block_count(samples: int) -> int:
     return int(np.clip(samples // LEAST_PER_BLOCK, 1, FINEST_BLOCKS))
 
 
-def assess(now: Whitened, terms: Terms, *, once: bool = False) -> Assessment:
+def assess(now: Whitened, terms: Terms, *, once: bool = False, noise: OwnNoise | None = None) -> Assessment:
     """Assess terms that no model holds yet, the coefficients of those that are in already being free as well.
 
     Two colours of noise are needed. A test of the null hypothesis uses the colour of the residual as it is: slow noise
@@ -112,6 +112,7 @@ def assess(now: Whitened, terms: Terms, *, once: bool = False) -> Assessment:
     now: the residual of the current model with its terms, in noise of the residual's own colour.
     terms: with the residual's samples as rows.
     once: whether they are of something that happens once.
+    noise: of the residual beside the given terms, where several terms are assessed in it.
     """
     residual, given = now.residual, now.given
     together = terms if given is None else joined([given, terms])
@@ -128,7 +129,7 @@ def assess(now: Whitened, terms: Terms, *, once: bool = False) -> Assessment:
     null_p = _p_of(null, first, max(stronger, 1.0))
     blocks = grams(residual, together, colours.across, colours.along, count)
     by_blocks = 0.0 if once else family_p(blocks, together.sensors, range(first, together.count))
-    own_p = OwnNoise(residual, given).p_value(terms) if by_blocks < BORNE_OUT else 1.0
+    own_p = (noise or OwnNoise(residual, given)).p_value(terms) if by_blocks < BORNE_OUT else 1.0
     p = own_p if once else by_blocks
     gain = held_out_gain(blocks, residual.freedom, blocked)
     focused = focused_gain(blocks, residual.freedom, blocked)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
 import numpy as np
@@ -39,6 +39,7 @@ class Grams:
         samples: (B,) how many samples a block holds.
         part_term, part_output, part_series, count: of the terms.
         projector: (3 S, 3 S); noise: (3 S,) nT, of the residual.
+        one_survey: whether each block is the whole survey, with terms of its own: the fit's freedom is the same in all.
     """
 
     zz: Array
@@ -57,6 +58,7 @@ class Grams:
     count: int
     projector: Array
     noise: Array
+    one_survey: bool = False
 
     @property
     def own(self) -> int:
@@ -201,7 +203,7 @@ def grams_of_each(white: Whitened, several: Sequence[Terms]) -> Grams:
 
     across, along, sighted = (None if s is None else s.repeat(count, axis=0) for s in white.sums(1))
     samples = np.full(count, float(len(white.residual.affine)))
-    return _grams(white, several, sums, (across, along, sighted), samples)
+    return replace(_grams(white, several, sums, (across, along, sighted), samples), one_survey=True)
 
 
 def _grams(
@@ -270,8 +272,9 @@ def normal(g: Grams) -> tuple[Array, Array]:
     n = np.zeros((batch, g.count, g.count))
     y = np.zeros((batch, g.count))
     raw = g.part_output != REFERENCE
+    each = slice(1) if g.one_survey else slice(None)
     if raw.any() and g.zz.any():
-        solve = np.linalg.solve(g.zz, np.concatenate([g.zd, g.ze], axis=2))
+        solve = np.linalg.solve(g.zz[each], np.concatenate([g.zd, g.ze], axis=2))
         k = g.dd.shape[1]
         t = g.dd - np.swapaxes(g.zd, 1, 2) @ solve[:, :, :k]
         c = g.de - np.swapaxes(g.zd, 1, 2) @ solve[:, :, k:]
@@ -282,7 +285,7 @@ def normal(g: Grams) -> tuple[Array, Array]:
         y += c[:, s, o] @ into.T
     if g.aa.any():
         m = g.own
-        own = _inverse(g.aa[:, :m, :m])
+        own = _inverse(g.aa[each, :m, :m])
         mixed = g.aa[:, :m, m:]
         turned = np.swapaxes(mixed, 1, 2) @ own
         n += g.aa[:, m:, m:] - turned @ mixed

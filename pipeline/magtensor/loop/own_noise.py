@@ -224,15 +224,14 @@ class OwnNoise:
     @cached_property
     def _levels(self) -> Array:
         """(B, 3 S) power of each output's noise over that of all, in each band."""
-        white = self._across / self._root_across[:, None]
-        return np.stack([_levels(white[i:j], self.residual.projector) for i, j in pairwise(self._edges)])
+        each = _grams(self._across / self._root_across[:, None], self._edges)
+        return _levels(each, np.diff(self._edges), self.residual.projector)
 
     @cached_property
     def _weights(self) -> Array:
         """(B, 3 S, 3 S) inverse covariance across of the sensors' noise in each band."""
         projector = self.residual.projector
-        each = [_inverse(projector * levels @ projector, 1e-9) for levels in self._levels]
-        return np.stack(each)
+        return _inverse(projector * self._levels[:, None] @ projector, 1e-9)
 
     @cached_property
     def _along(self) -> Array:
@@ -321,33 +320,40 @@ def smoothed_spectrum(power: Array) -> Array:
     return np.concatenate([smooth[:1], smooth])
 
 
-def _levels(white: Array, projector: Array) -> Array:
-    """(3 S,) the likeliest power of each output's noise in whitened values across (K, 3 S).
+def _levels(squares: Array, counts: NDArray[np.int_], projector: Array) -> Array:
+    """(B, 3 S), the likeliest power of each output's noise in whitened values across.
 
     First of each sensor, then of each of its axes, held to that of the sensor as by some values more of the same power.
     Two sensors have one contrast, which does not tell whose noise it is.
+
+    Parameters
+    ----------
+    squares: (B, 3 S, 3 S) products of the values of each band; counts: (B,) how many it has.
     """
     outputs, sensors = len(projector), len(projector) // 3
-    covariance = white.T @ white / len(white)
+    covariance = squares / counts[:, None, None]
     if sensors < 3:
-        return np.full(outputs, float(np.trace(covariance)) / (outputs - 3))
-    of_sensors = _scored(covariance, projector, np.ones(outputs), 3, 1.0)
-    values = len(white) * (sensors - 1) / sensors
+        mean = np.trace(covariance, axis1=1, axis2=2) / (outputs - 3)
+        return np.repeat(mean[:, None], outputs, axis=1)
+    of_sensors = _scored(covariance, projector, np.ones((len(counts), outputs)), 3, np.ones(len(counts)))
+    values = counts * (sensors - 1) / sensors
     return _scored(covariance, projector, of_sensors, 1, values / (values + ALIKE))
 
 
-def _scored(covariance: Array, projector: Array, levels: Array, alike: int, weight: float) -> Array:
-    """Levels (3 S,), those of so many neighbours alike, by steps of scoring on the logarithms from those given, which
-    count for the rest of the weight; halved, the steps keep the levels positive and raise the likelihood."""
-    first = levels
+def _scored(covariance: Array, projector: Array, levels: Array, alike: int, weight: Array) -> Array:
+    """Levels (B, 3 S), those of so many neighbours alike, by steps of scoring on the logarithms from those given, which
+    count for the rest of the weight (B,); halved, the steps keep the levels positive and raise the likelihood."""
+    first, weight = levels, weight[:, None]
+
+    def of_neighbours(matrices: Array) -> Array:
+        each = np.diagonal(matrices, axis1=1, axis2=2).reshape(len(levels), -1, alike)
+        return np.repeat(each.sum(axis=2), alike, axis=1)
+
     for _ in range(_SCORING):
-        inverse = _inverse(projector * levels @ projector, 1e-9)
-        seen, expected = (
-            np.repeat(np.diagonal(m).reshape(-1, alike).sum(axis=1), alike)
-            for m in (inverse @ covariance @ inverse, inverse)
-        )
+        inverse = _inverse(projector * levels[:, None] @ projector, 1e-9)
+        seen, expected = of_neighbours(inverse @ covariance @ inverse), of_neighbours(inverse)
         likeliest = levels * np.sqrt(np.maximum(seen, 1e-12 * expected) / expected)
-        levels = np.asarray(weight * likeliest + (1.0 - weight) * first)
+        levels = weight * likeliest + (1.0 - weight) * first
     return levels
 
 

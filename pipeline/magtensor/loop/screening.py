@@ -15,6 +15,7 @@ from magtensor.loop.evidence import Whitened
 from magtensor.loop.gates import Candidate, explained_before
 from magtensor.loop.log_noise import brought_in, channels_of
 from magtensor.loop.model import Adopted, State, generic
+from magtensor.loop.own_noise import OwnNoise
 from magtensor.loop.profiling import REFINING_SAMPLES, SCREENING_SAMPLES, Thinned, best_settings, refined, terms_of
 from magtensor.loop.scoring import Scorer
 from magtensor.loop.separation import Assessed, lower_orders, lowest
@@ -91,6 +92,7 @@ def _looked_at(state: State, scored: Sequence[_Screened], failed: dict[str, str]
     """Models with their settings refined, and with lower orders where they have such, assessed on all samples."""
     residual = state.residual
     now = Whitened.of(residual, state.colours.across, state.colours.along, state.terms)
+    noise = OwnNoise(residual, state.terms)
 
     def moved(each: _Screened) -> tuple[dict[str, Any], dict[str, str]]:
         fails: dict[str, str] = {}
@@ -106,7 +108,7 @@ def _looked_at(state: State, scored: Sequence[_Screened], failed: dict[str, str]
         terms = terms_of(each.model, each.settings, state.excitation, failed)
         assert terms is not None
         terms = terms.at(residual.samples)
-        return terms, assess(now, terms, once=happens_once(Adopted(each.model, each.settings)))
+        return terms, assess(now, terms, once=happens_once(Adopted(each.model, each.settings)), noise=noise)
 
     chosen = list(distinct.values())
     return [

@@ -8,7 +8,7 @@ cosines, each in three axes, are random quantities of known variance here, and a
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -33,15 +33,21 @@ class SlowModes:
 
     Attributes:
         response: (N, 3) d along / d whitened output in the plane the sensors share.
+        wanted: how many cosines are asked for.
     """
 
     response: Array
+    wanted: int = MOST_MODES
 
     @property
     def most(self) -> int:
-        """How many cosines are used at most."""
+        """How many cosines are used, the slowest ones."""
         n = len(self.response)
-        return int(max(min(MOST_MODES, MOST_ENTRIES / (3 * n), n // STEPS), 0))
+        return int(max(min(self.wanted, MOST_ENTRIES / (3 * n), n // STEPS), 0))
+
+    def slowest(self, count: int) -> SlowModes:
+        """So many of them, which may be held for longer."""
+        return replace(self, wanted=count)
 
     @property
     def step(self) -> int:
@@ -62,10 +68,10 @@ class SlowModes:
         return out.reshape(3 * self.most, -1)
 
     def made_of(self, coefficients: Array) -> Array:
-        """(N, Q) series that have such coefficients (3 K', Q) in the slowest cosines times response."""
+        """(N, Q) series that have such coefficients (3 K, Q) in the cosines times response."""
         from scipy.fft import dct
 
-        k, q, n = len(coefficients) // 3, coefficients.shape[1], len(self.response)
+        k, q, n = self.most, coefficients.shape[1], len(self.response)
         spectrum = np.zeros((len(self._held), 3, q))
         spectrum[1 : k + 1] = coefficients.reshape(k, 3, q) / np.sqrt(2.0 * n)
         out: Array = (self._held @ dct(spectrum, axis=0, type=3)).reshape(-1, q)
@@ -99,7 +105,7 @@ class TurnedColour:
 
     Attributes:
         modes: what the slow noise looks like.
-        variance: (M,) of the first M columns of the modes, in the units of the squared residual over `white`.
+        variance: (M,) of the columns of the modes, in the units of the squared residual over `white`.
         rest: the colour of what is left when they are filtered out.
     """
 
@@ -115,15 +121,14 @@ class TurnedColour:
     @property
     def lowest(self) -> float:
         """Power at the lowest frequency over the white level."""
-        shown = self.variance * np.diag(self.modes.gram)[: len(self.variance)]
+        shown = self.variance * np.diag(self.modes.gram)
         return self.rest.lowest * float(1.0 + shown.max())
 
     @cached_property
     def _root(self) -> tuple[Array, Array]:
         """sqrt(variance) (M,), and the lower Cholesky factor (M, M) of one plus the modes' power over the white."""
         size = np.sqrt(self.variance)
-        m = len(size)
-        return size, np.linalg.cholesky(np.eye(m) + self.modes.gram[:m, :m] * np.outer(size, size))
+        return size, np.linalg.cholesky(np.eye(len(size)) + self.modes.gram * np.outer(size, size))
 
     def log_volume(self, count: int) -> float:
         """As `Colour.log_volume`."""
@@ -143,7 +148,7 @@ class TurnedColour:
 
         size, root = self._root
         columns = series.reshape(len(series), -1)
-        shown = size[:, None] * self.modes.seen_in(columns)[: len(size)]
+        shown = size[:, None] * self.modes.seen_in(columns)
         taken = solve_triangular(root, shown, lower=True, check_finite=False)
         taken = solve_triangular(root + np.eye(len(size)), taken, trans="T", lower=True, check_finite=False)
         out: Array = columns - self.modes.made_of(size[:, None] * taken)
