@@ -223,7 +223,7 @@ def taken_off(
     terms = joined([model.terms(x) for model, _ in applied])
     response = np.zeros((terms.series.shape[1], 3 * sensors, terms.count))
     use = terms.part_output != REFERENCE
-    np.add.at(response, (terms.part_series[use], terms.part_output[use], terms.part_term[use]), 1.0)
+    np.add.at(response, (terms.part_series[use], terms.part_output[use], terms.part_term[use]), terms.part_weight[use])
     size = 12 * sensors
     kept = [*range(size), *(size + k for _, own in applied for k in own)]
     covariance = np.asarray(calibration.values(COVARIANCE), dtype=float)[np.ix_(kept, kept)]

@@ -52,6 +52,7 @@ def _without_common_part(each: Terms, larger: Array, shares: Array) -> Terms:
         part_term=np.concatenate([each.part_term, np.repeat(having, len(outputs))]),
         part_output=np.concatenate([each.part_output, np.tile(outputs, len(having))]),
         part_series=np.concatenate([each.part_series, each.series.shape[1] + np.arange(len(having) * len(outputs))]),
+        part_weight=np.concatenate([each.part_weight, np.ones(len(having) * len(outputs))]),
     )
 
 

@@ -79,8 +79,7 @@ def turn_step(x: Excitation, *, time_s: EventTime = 0.0) -> Terms:
     knocks are several models of this name. A turn common to all sensors is not visible without a vector reference.
     Rivals: `scale_step` and `offset_step` where the attitude hardly changes.
     """
-    after = (x.elapsed >= time_s)[:, None, None]
-    return joined([x.one_each(after * t, "arcmin", name) for name, t in _by_an_arcmin(x, 3)])
+    return joined(_by_an_arcmin(x, (x.elapsed >= time_s).astype(float), "arcmin", 3))
 
 
 @error_model(
@@ -107,9 +106,8 @@ def temperature_alignment(
     temperature rises steadily; `turn_step`.
     """
     name = THERMOMETER.pick(x, channel)
-    course = x.thermometer(name, lag_s, delayed, at_start).reshape(len(x.time), -1, 1)
-    units = f"arcmin/{x.units[name]}"
-    return joined([x.one_each(course * t, units, label) for label, t in _by_an_arcmin(x, angles)])
+    course = x.thermometer(name, lag_s, delayed, at_start)
+    return joined(_by_an_arcmin(x, course, f"arcmin/{x.units[name]}", angles))
 
 
 @error_model(
@@ -136,21 +134,23 @@ def alignment_drift(
     are seen.
     """
     course = np.expm1(-np.clip(x.elapsed, 0.0, span_s) / tau_s) / np.expm1(-span_s / tau_s)
-    return joined([x.one_each(course[:, None, None] * t, "arcmin", label) for label, t in _by_an_arcmin(x, angles)])
+    return joined(_by_an_arcmin(x, course, "arcmin", angles))
 
 
-def _by_an_arcmin(x: Excitation, angles: int) -> list[tuple[str, Array]]:
-    """Label and (N, S, 3) nT: what each sensor reads more when it turns by an arcmin about an axis of the platform, and
-    of six angles also when two of its own axes lean by as much towards each other."""
-    turned = [(name, x.sensed(np.cross(x.field, axis * ARCMIN))) for name, axis in zip(AXES, np.eye(3), strict=True)]
+def _by_an_arcmin(x: Excitation, course: Array, units: str, angles: int) -> list[Terms]:
+    """What each sensor reads more when it turns by an arcmin about an axis of the platform, times a course (N,) or that
+    of each sensor (N, S), and of six angles also when two of its own axes lean by as much towards each other."""
+    turned = [
+        x.one_each_sensing(course, np.cross(x.field_or_fields, axis * ARCMIN), units, name)
+        for name, axis in zip(AXES, np.eye(3), strict=True)
+    ]
     if angles == 3:
         return turned
-    read = ARCMIN * x.driving(of_field=True)
     leaning = []
     for i, j in ((0, 1), (0, 2), (1, 2)):
-        more = np.zeros_like(read)
-        more[..., i], more[..., j] = read[..., j], read[..., i]
-        leaning.append((AXES[i] + AXES[j], more))
+        axes = np.zeros((3, 3))
+        axes[i, j] = axes[j, i] = ARCMIN
+        leaning.append(x.one_each_sensing(course, x.field_or_fields, units, AXES[i] + AXES[j], axes))
     return [*turned, *leaning]
 
 

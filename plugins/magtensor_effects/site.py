@@ -128,7 +128,7 @@ def passing_source(
     u = (x.elapsed - time_s) / passage_s
     dipole = [u**k / (1 + u**2) ** 2.5 for k in range(3)]
     if not whole:
-        return joined([x.shared(f[:, None, None] * x.along, "nT", f"u{k}") for k, f in enumerate(dipole)])
+        return joined([x.shared_sensing(f, x.direction, "nT", f"u{k}") for k, f in enumerate(dipole)])
     places = _places(x)
     patterns = [(AXES[i], "nT", np.broadcast_to(axis, x.output.shape), dipole) for i, axis in enumerate(np.eye(3))]
     steeper = [u**k / (1 + u**2) ** 3.5 for k in range(4)]

@@ -31,14 +31,15 @@ def drawn_terms(seed: int, names: str, samples: int = 20) -> Terms:
     return Terms(
         tuple(names), tuple("AB"[i % 2] for i in range(count)), ("nT",) * count, rng.standard_normal((samples, 3)),
         np.repeat(np.arange(count), 2), rng.integers(REFERENCE, 6, parts), rng.integers(0, 3, parts),
+        part_weight=rng.standard_normal(parts),
     )  # fmt: skip
 
 
 def dense(terms: Terms, outputs: int) -> Array:
     """(N, outputs + 1, P): every term on every output, the reference last; part by part."""
     out = np.zeros((len(terms.series), outputs + 1, terms.count))
-    for t, o, s in zip(terms.part_term, terms.part_output, terms.part_series, strict=True):
-        out[:, o, t] += terms.series[:, s]  # REFERENCE is -1: the last
+    for t, o, s, w in zip(terms.part_term, terms.part_output, terms.part_series, terms.part_weight, strict=True):
+        out[:, o, t] += w * terms.series[:, s]  # REFERENCE is -1: the last
     return out
 
 
@@ -54,6 +55,7 @@ def test_terms_add_up() -> None:
     assert (some.names, some.sensors) == (("y", "a", "c"), ("B", "A", "A"))
     np.testing.assert_allclose(dense(some, 6), dense(both, 6)[:, :, [5, 0, 2]])
     np.testing.assert_allclose(dense(both.at(np.array([4, 2])), 6), dense(both, 6)[[4, 2]])
+    np.testing.assert_allclose(dense(both.unweighted, 6), dense(both, 6))
 
 
 def models_terms(record: Record) -> Terms:
@@ -68,6 +70,8 @@ def models_terms(record: Record) -> Terms:
             x.matrices(1e-4 * np.cos(5 * t)[:, None] * x.field[:, 0], "1").only(range(5)),
             x.shared(np.sin(7 * t)[:, None, None] * np.ones(x.output.shape), "nT", "all"),
             x.on_reference(np.cos(11 * t), "nT", "F"),
+            x.one_each_sensing(np.sin(3 * t), 1e-4 * x.field[:, 0] * [1.0, -0.3, 0.2], "1", "stretched"),
+            x.shared_sensing(np.cos(3 * t), x.direction, "nT", "longer"),
         ]
     )
 

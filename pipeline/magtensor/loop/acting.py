@@ -19,7 +19,7 @@ class Acting(ABC):
     """Terms of a survey: N samples of S sensors.
 
     Attributes:
-        time: (N,) s; sensors: names; output, field: (N, S, 3) nT, as in `Excitation`.
+        time: (N,) s; sensors: names; output, field: (N, S, 3) nT; matrix: (S, 3, 3) C; as in `Excitation`.
     """
 
     if TYPE_CHECKING:
@@ -35,6 +35,9 @@ class Acting(ABC):
 
         @property
         def field(self) -> Array: ...
+
+        @property
+        def matrix(self) -> Array: ...
 
         @property
         def rate(self) -> Array: ...
@@ -89,6 +92,32 @@ class Acting(ABC):
         columns = np.asarray(series, dtype=float).reshape(len(self.time), -1)
         outputs = np.arange(3 * s)
         return Terms((name,) * s, self.sensors, (units,) * s, columns, outputs // 3, outputs, outputs)
+
+    def one_each_sensing(
+        self, course: Array, vectors: Array, units: str, name: str, axes: Array | None = None
+    ) -> Terms:
+        """What sensors see of a vector (N, 3), or one for each sensor (N, S, 3), times a course (N,), or that of each
+        sensor (N, S): one coefficient a sensor. `axes` (3, 3): how each axis shows what all three see."""
+        columns, outputs, index, weights = self._sensing(course, vectors, axes)
+        names, units_ = (name,) * len(self.sensors), (units,) * len(self.sensors)
+        return Terms(names, self.sensors, units_, columns, outputs // 3, outputs, index, part_weight=weights)
+
+    def shared_sensing(self, course: Array, vectors: Array, units: str, name: str) -> Terms:
+        """The same with one coefficient for all sensors."""
+        columns, outputs, index, weights = self._sensing(course, vectors, None)
+        return Terms((name,), ("",), (units,), columns, np.zeros_like(outputs), outputs, index, part_weight=weights)
+
+    def _sensing(
+        self, course: Array, vectors: Array, axes: Array | None
+    ) -> tuple[Array, NDArray[np.int_], NDArray[np.int_], Array]:
+        """Series, and of the parts that make of them what sensors see the outputs, series and weights."""
+        one = course.ndim == 1 and vectors.ndim == 2
+        of_each = vectors if vectors.ndim == 3 else vectors[:, None]
+        columns = (course.reshape(len(course), -1, 1) * of_each).reshape(len(course), -1)
+        outputs = np.repeat(np.arange(3 * len(self.sensors)), 3)
+        component = np.tile(np.arange(3), 3 * len(self.sensors))
+        weights = self.matrix if axes is None else axes @ self.matrix
+        return columns, outputs, component if one else 3 * (outputs // 3) + component, weights.reshape(-1)
 
     def late(self, course: Array, units: str, name: str, *, per_axis: bool = False) -> Terms:
         """Outputs late by a coefficient times a course (N,), s: one coefficient a sensor, or one an axis."""

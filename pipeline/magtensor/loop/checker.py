@@ -190,8 +190,8 @@ def _shape(terms: Terms, x: Excitation) -> list[str]:
         return [f"has {p} names, {len(terms.sensors)} sensors and {len(terms.units)} units: as many would be right"]
     if terms.series.ndim != 2 or len(terms.series) != len(x.time):
         return [f"its series are {terms.series.shape}; ({len(x.time)}, K) would be right"]
-    if len(terms.part_output) != parts or len(terms.part_series) != parts:
-        return ["part_term, part_output and part_series differ in length"]
+    if not len(terms.part_output) == len(terms.part_series) == len(terms.part_weight) == parts:
+        return ["part_term, part_output, part_series and part_weight differ in length"]
     if set(terms.sensors) - set(x.sensors) - {""}:
         return [f"names sensors that the survey has not: {', '.join(sorted(set(terms.sensors) - set(x.sensors)))}"]
     limits = (
@@ -212,6 +212,7 @@ def _same(one: Terms, other: Terms) -> bool:
     words = (one.names, one.sensors, one.units) == (other.names, other.sensors, other.units)
     pairs = [(one.series, other.series), (one.part_term, other.part_term)]
     pairs += [(one.part_output, other.part_output), (one.part_series, other.part_series)]
+    pairs += [(one.part_weight, other.part_weight)]
     return words and all(np.array_equal(a, b, equal_nan=a.dtype.kind == "f") for a, b in pairs)
 
 

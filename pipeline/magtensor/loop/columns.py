@@ -60,13 +60,13 @@ def _columns(residual: Residual, several: Sequence[Terms], response: Array, show
     own = ~wide[which] | (output == REFERENCE)
     base = [series[:, which[own]] * shown[output[own]]]
     mix = [np.zeros((int(own.sum()), first.count))]
-    mix[0][np.arange(len(mix[0])), term[own]] = 1.0
+    mix[0][np.arange(len(mix[0])), term[own]] = first.part_weight[own]
     if wide.any():
         size = 3 * int(wide.sum())
         base.append((series[:, wide, None] * response.T).reshape(len(several), size, -1))
         each = np.zeros((size // 3, 3, first.count))
         place = (np.cumsum(wide) - 1)[which[~own]]
-        by_output = residual.basis[output[~own]] / residual.noise[output[~own], None]
+        by_output = residual.basis[output[~own]] * (first.part_weight[~own] / residual.noise[output[~own]])[:, None]
         np.add.at(each, (place[:, None], np.arange(3), term[~own, None]), by_output)
         mix.append(each.reshape(size, first.count))
     rows, together = np.concatenate(base, axis=1), np.vstack(mix)

@@ -26,6 +26,34 @@ _INNER_RANK = 1e-9
 
 
 @dataclass(frozen=True)
+class Pieces:
+    """What coefficients do across, series by series.
+
+    Attributes:
+        term, series: (R,) whose coefficient times which series.
+        across: (R, 3 S) 1/nT, how it acts on the whitened outputs, what the sensors share projected off.
+        shown: (R, R) products of that; alone: (R,) its square, were each output seen by itself.
+    """
+
+    term: NDArray[np.int_]
+    series: NDArray[np.int_]
+    across: Array
+    shown: Array
+    alone: Array
+
+    @classmethod
+    def of(cls, terms: Terms, residual: Residual) -> Pieces:
+        raw = np.flatnonzero(terms.part_output != REFERENCE)
+        count, on = max(terms.series.shape[1], 1), terms.part_output[raw]
+        kinds, which = np.unique(terms.part_term[raw] * count + terms.part_series[raw], return_inverse=True)
+        outputs = np.zeros((len(kinds), len(residual.noise)))
+        np.add.at(outputs, (which, on), terms.part_weight[raw] / residual.noise[on])
+        across = outputs @ residual.projector
+        alone = outputs**2 @ np.diagonal(residual.projector)
+        return cls(kinds // count, kinds % count, across, across @ across.T, alone)
+
+
+@dataclass(frozen=True)
 class Grams:
     """Sums over each of B blocks.
 
@@ -37,8 +65,7 @@ class Grams:
             directions added.
         rr: (B,) square of the residual along, that of known directions added.
         samples: (B,) how many samples a block holds.
-        part_term, part_output, part_series, count: of the terms.
-        projector: (3 S, 3 S); noise: (3 S,) nT, of the residual.
+        pieces, count: of the terms.
         one_survey: whether each block is the whole survey, with terms of its own: the fit's freedom is the same in all.
     """
 
@@ -52,12 +79,8 @@ class Grams:
     ar: Array
     rr: Array
     samples: Array
-    part_term: NDArray[np.int_]
-    part_output: NDArray[np.int_]
-    part_series: NDArray[np.int_]
+    pieces: Pieces
     count: int
-    projector: Array
-    noise: Array
     one_survey: bool = False
 
     @property
@@ -85,7 +108,7 @@ class Grams:
     def _with(self, f: Callable[[Array], Array]) -> Grams:
         return Grams(
             f(self.zz), f(self.zd), f(self.dd), f(self.ze), f(self.de), f(self.ee), f(self.aa), f(self.ar), f(self.rr),
-            f(self.samples), self.part_term, self.part_output, self.part_series, self.count, self.projector, self.noise,
+            f(self.samples), self.pieces, self.count,
         )  # fmt: skip
 
 
@@ -261,8 +284,7 @@ def _grams(
     if sighted is not None and white.known_sighted is not None:
         add(sighted, white.known_sighted, across_directions(residual, several) if several else None, lambda c: c)
     return Grams(
-        zz, zd, dd, ze, de, ee, aa, ar, rr, samples,
-        together.part_term, together.part_output, together.part_series, p, residual.projector, residual.noise,
+        zz, zd, dd, ze, de, ee, aa, ar, rr, samples, Pieces.of(together, residual), p,
     )  # fmt: skip
 
 
@@ -271,18 +293,17 @@ def normal(g: Grams) -> tuple[Array, Array]:
     batch = len(g.zz)
     n = np.zeros((batch, g.count, g.count))
     y = np.zeros((batch, g.count))
-    raw = g.part_output != REFERENCE
-    each = slice(1) if g.one_survey else slice(None)
-    if raw.any() and g.zz.any():
+    pieces, each = g.pieces, slice(1) if g.one_survey else slice(None)
+    if len(pieces.term) and g.zz.any():
         solve = np.linalg.solve(g.zz[each], np.concatenate([g.zd, g.ze], axis=2))
         k = g.dd.shape[1]
         t = g.dd - np.swapaxes(g.zd, 1, 2) @ solve[:, :, :k]
         c = g.de - np.swapaxes(g.zd, 1, 2) @ solve[:, :, k:]
-        o, s = g.part_output[raw], g.part_series[raw]
-        parts = t[:, s[:, None], s[None, :]] * g.projector[o[:, None], o[None, :]]
+        s = pieces.series
+        parts = t[:, s[:, None], s[None, :]] * pieces.shown
         into = _incidence(g)
         n += into @ parts @ into.T
-        y += c[:, s, o] @ into.T
+        y += np.einsum("bro,ro->br", c[:, s], pieces.across) @ into.T
     if g.aa.any():
         m = g.own
         own = _inverse(g.aa[each, :m, :m])
@@ -303,10 +324,9 @@ def _inverse(information: Array) -> Array:
 
 
 def _incidence(g: Grams) -> Array:
-    """(P, parts on raw outputs): 1 / noise of the output where the part belongs to the term."""
-    raw = np.flatnonzero(g.part_output != REFERENCE)
-    into = np.zeros((g.count, len(raw)))
-    into[g.part_term[raw], np.arange(len(raw))] = 1.0 / g.noise[g.part_output[raw]]
+    """(P, R): 1 where a piece belongs to the term."""
+    into = np.zeros((g.count, len(g.pieces.term)))
+    into[g.pieces.term, np.arange(len(g.pieces.term))] = 1.0
     return into
 
 
@@ -329,13 +349,10 @@ def _loss(train: Grams, test: Grams, theta: Array) -> Array:
     batch = len(theta)
     loss = np.zeros(batch)
     if train.zz.any():
-        k, size = train.dd.shape[1], len(train.noise)
-        raw = np.flatnonzero(train.part_output != REFERENCE)
-        w = np.zeros((batch, k, size))
-        for j in raw:
-            o = train.part_output[j]
-            w[:, train.part_series[j], o] += theta[:, train.part_term[j]] / train.noise[o]
-        w = w @ train.projector
+        pieces = train.pieces
+        w = np.zeros((batch, train.dd.shape[1], train.ze.shape[2]))
+        for term, series, across in zip(pieces.term, pieces.series, pieces.across, strict=True):
+            w[:, series] += theta[:, term, None] * across
         own = np.linalg.solve(train.zz, train.ze - train.zd @ w)
         loss += test.ee + np.sum(own * (test.zz @ own + 2 * (test.zd @ w - test.ze)), axis=(1, 2))
         loss += np.sum(w * (test.dd @ w - 2 * test.de), axis=(1, 2))

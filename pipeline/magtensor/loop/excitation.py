@@ -241,9 +241,11 @@ class Excitation(Acting):
         return into_platform_frame(self.attitude, self.field.mean(axis=1)).T
 
     @cached_property
-    def along(self) -> Array:
-        """(N, S, 3): what the sensors make of a unit vector along the field."""
-        return self.sensed(self.field / np.linalg.norm(self.field, axis=2, keepdims=True))
+    def direction(self) -> Array:
+        """(N, 3) or (N, S, 3), the unit vector along `field_or_fields`."""
+        field = self.field_or_fields
+        out: Array = field / np.linalg.norm(field, axis=-1, keepdims=True)
+        return out
 
     @cached_property
     def gradient(self) -> Array:

@@ -111,8 +111,9 @@ class OwnNoise:
             return None
         size, own, count = len(residual.noise), residual.affine.shape[1], terms.series.shape[1]
         outputs = terms.part_output[raw]
+        weights = terms.part_weight[raw] / residual.noise[outputs]
         into = np.zeros((count + own, terms.count + own * size, size))
-        np.add.at(into, (terms.part_series[raw], terms.part_term[raw], outputs), 1.0 / residual.noise[outputs])
+        np.add.at(into, (terms.part_series[raw], terms.part_term[raw], outputs), weights)
         for a in range(own):
             first = terms.count + a * size
             into[count + a, first : first + size] = np.eye(size)

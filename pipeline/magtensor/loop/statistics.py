@@ -91,32 +91,33 @@ def own_information(g: Grams) -> Array:
 def own_information_of_each(g: Grams) -> Array:
     """(B, P) the same of each block or set."""
     out = np.zeros((len(g.zz), g.count))
-    raw = np.flatnonzero(g.part_output >= 0)
-    if len(raw) and g.zz.any():
-        squares = np.maximum(np.diagonal(g.zz, axis1=1, axis2=2)[:, 3:], 1e-300)
+    pieces = g.pieces
+    if len(pieces.term) and g.zz.any():
+        varying = g.zd[:, 3:] / np.sqrt(np.maximum(np.diagonal(g.zz, axis1=1, axis2=2)[:, 3:], 1e-300))[:, :, None]
 
         def of_pairs(i: NDArray[np.int_], j: NDArray[np.int_]) -> Array:
-            a, b, o, p = g.part_series[i], g.part_series[j], g.part_output[i], g.part_output[j]
-            constant = np.sum(g.zd[:, 3:, a] * g.zd[:, 3:, b] / squares[:, :, None], axis=1)
-            found: Array = (g.dd[:, a, b] - constant) * (g.projector[o, p] / (g.noise[o] * g.noise[p]))
+            a, b = pieces.series[i], pieces.series[j]
+            found: Array = g.dd[:, a, b] - np.sum(varying[:, :, a] * varying[:, :, b], axis=1)
             return found
 
-        alone = of_pairs(raw, raw)
-        size = g.dd[:, g.part_series[raw], g.part_series[raw]] * g.projector[g.part_output[raw], g.part_output[raw]]
-        alone = np.maximum(alone, 1e-12 * size / g.noise[g.part_output[raw]] ** 2)
-        np.add.at(out.T, g.part_term[raw], alone.T)
-        i, j = _pairs_within(g.part_term[raw])
-        if len(i):  # what moves all sensors alike is in the plane that they share, whatever each output shows alone
-            together = out.copy()
-            np.add.at(together.T, g.part_term[raw[i]], of_pairs(raw[i], raw[j]).T)
-            out = np.maximum(together, IDENTIFIABLE * out)
+        every = np.arange(len(pieces.term))
+        size = of_pairs(every, every)
+        alone = np.maximum(size, 1e-12 * g.dd[:, pieces.series, pieces.series]) * pieces.alone
+        np.add.at(out.T, pieces.term, alone.T)
+        # what moves all sensors alike is in the plane that they share, whatever each output shows alone
+        together = np.zeros_like(out)
+        np.add.at(together.T, pieces.term, (size * np.diagonal(pieces.shown)).T)
+        i, j = _pairs_within(pieces.term)
+        if len(i):
+            np.add.at(together.T, pieces.term[i], (of_pairs(i, j) * pieces.shown[i, j]).T)
+        out = np.maximum(together, IDENTIFIABLE * out)
     if g.aa.any():
         out += np.diagonal(g.aa, axis1=1, axis2=2)[:, g.own :]
     return out
 
 
 def _pairs_within(terms: NDArray[np.int_]) -> tuple[NDArray[np.int_], NDArray[np.int_]]:
-    """(R,), (R,) all ordered pairs of two different parts of one term."""
+    """(K,), (K,) all ordered pairs of two different pieces of one term."""
     order = np.argsort(terms, kind="stable")
     groups = np.split(order, np.flatnonzero(np.diff(terms[order])) + 1)
     pairs = [(a, b) for group in groups if len(group) > 1 for a, b in itertools.permutations(group.tolist(), 2)]
@@ -324,14 +325,12 @@ def focused_folds(g: Grams, blocked: NDArray[np.bool_]) -> NDArray[np.int_]:
 def _share_of_blocks(g: Grams, chosen: NDArray[np.bool_]) -> Array:
     """(B,) how much of what is known of some terms (P,) each block knows, constants left out; the sum is 1."""
     info = np.diagonal(g.aa, axis1=1, axis2=2)[:, g.own :].copy()
-    raw = g.part_output >= 0
-    if raw.any() and g.zz.any():
+    pieces = g.pieces
+    if len(pieces.term) and g.zz.any():
         own, mixed = g.zz[:, 3, 3], g.zd[:, 3]
         mean = mixed.sum(axis=0) / own.sum()
         size = np.diagonal(g.dd, axis1=1, axis2=2) - 2.0 * mean * mixed + mean**2 * own[:, None]
-        o = g.part_output[raw]
-        each = size[:, g.part_series[raw]] * g.projector[o, o] / g.noise[o] ** 2
-        np.add.at(info.T, g.part_term[raw], each.T)
+        np.add.at(info.T, pieces.term, (size[:, pieces.series] * pieces.alone).T)
     info = np.maximum(info[:, chosen], 0.0)
     out: Array = (info / np.maximum(info.sum(axis=0), 1e-300)).mean(axis=1)
     return out

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,10 +22,10 @@ class Terms:
         sensors: (P,) the sensor's name, "" for one shared by all or of the reference.
         units: (P,) of the coefficient.
         series: (N, K) distinct regressors, nT per unit of the coefficient.
-        part_term, part_output, part_series: (Q,) each part adds coefficient times series to an output, numbered
-            3 * sensor + axis, or REFERENCE.
+        part_term, part_output, part_series, part_weight: (Q,) each part adds coefficient times series times weight to
+            an output, numbered 3 * sensor + axis, or REFERENCE; all weights are 1 where none are given.
         delay: (N, K) s by which a unit of the coefficient makes outputs late, of which the series is what that adds to
-            first order; None where series are added as they are.
+            first order, of weight 1; None where series are added as they are.
     """
 
     names: tuple[str, ...]
@@ -36,6 +36,11 @@ class Terms:
     part_output: NDArray[np.int_]
     part_series: NDArray[np.int_]
     delay: Array | None = None
+    part_weight: Array = field(default_factory=lambda: np.zeros(0))
+
+    def __post_init__(self) -> None:
+        if not len(self.part_weight):
+            object.__setattr__(self, "part_weight", np.ones(len(self.part_term)))
 
     @property
     def count(self) -> int:
@@ -53,7 +58,8 @@ class Terms:
     def _on_outputs(self, series: Array, coefficients: Array, outputs: int) -> Array:
         weights = np.zeros((series.shape[1], outputs))
         raw = self.part_output >= 0
-        np.add.at(weights, (self.part_series[raw], self.part_output[raw]), coefficients[self.part_term[raw]])
+        each = self.part_weight[raw] * coefficients[self.part_term[raw]]
+        np.add.at(weights, (self.part_series[raw], self.part_output[raw]), each)
         out: Array = series @ weights
         return out
 
@@ -61,7 +67,7 @@ class Terms:
         """(N,) nT that the coefficients add to the reference total field."""
         weights = np.zeros(self.series.shape[1])
         own = self.part_output == REFERENCE
-        np.add.at(weights, self.part_series[own], coefficients[self.part_term[own]])
+        np.add.at(weights, self.part_series[own], self.part_weight[own] * coefficients[self.part_term[own]])
         out: Array = self.series @ weights
         return out
 
@@ -89,7 +95,16 @@ class Terms:
             self.part_output[parts],
             self.part_series[parts],
             self.delay,
+            self.part_weight[parts],
         )
+
+    @property
+    def unweighted(self) -> Terms:
+        """The same with a series for each part."""
+        order = np.arange(len(self.part_term))
+        series = self.series[:, self.part_series] * self.part_weight
+        delay = None if self.delay is None else self.delay[:, self.part_series]
+        return replace(self, series=series, part_series=order, delay=delay, part_weight=np.ones(len(order)))
 
 
 def stacked(parts: Sequence[Terms]) -> Terms:
@@ -99,6 +114,8 @@ def stacked(parts: Sequence[Terms]) -> Terms:
     ------
     ValueError: the coefficients are not the same on all of them.
     """
+    if not all(np.array_equal(part.part_weight, parts[0].part_weight) for part in parts[1:]):
+        parts = [part.unweighted for part in parts]
     first = parts[0]
     for part in parts[1:]:
         same = all(np.array_equal(a, b) for a, b in zip(_places(first), _places(part), strict=True))
@@ -113,8 +130,8 @@ def stacked(parts: Sequence[Terms]) -> Terms:
     return replace(first, series=np.concatenate([p.series for p in parts]), delay=delay)
 
 
-def _places(terms: Terms) -> tuple[NDArray[np.int_], ...]:
-    return terms.part_term, terms.part_output, terms.part_series
+def _places(terms: Terms) -> tuple[NDArray[np.int_] | Array, ...]:
+    return terms.part_term, terms.part_output, terms.part_series, terms.part_weight
 
 
 def joined(parts: list[Terms]) -> Terms:
@@ -131,4 +148,5 @@ def joined(parts: list[Terms]) -> Terms:
         np.concatenate([p.part_term + terms[i] for i, p in enumerate(parts)]),
         np.concatenate([p.part_output for p in parts]),
         np.concatenate([p.part_series + series[i] for i, p in enumerate(parts)]),
+        part_weight=np.concatenate([p.part_weight for p in parts]),
     )
