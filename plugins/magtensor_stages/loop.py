@@ -98,15 +98,15 @@ def close_loop(
     else:
         made = inquiry
         inquiry, found, refused = settled(lambda _: made, made.how, None)
-    begin, how = inquiry.declared, inquiry.how
+    begin, how = inquiry.declared, found.how
     looked_at, keep = found.record, found.last.fit.keep
     left = unexplained(found, looked_at)
     folds = folds_for(found.last)
-    before = held_out_error(looked_at, begin, how, found.first.theta, keep, folds)
+    before = held_out_error(looked_at, begin, inquiry.how, found.first.theta, keep, folds)
     same = len(found.last.adopted) == len(begin)
     seen = as_elsewhere(looked_at, calibrated(found.last.fit), found.last)
     after = before if same else held_out_error(seen, found.last.adopted, how, found.last.theta, keep, folds)
-    slow = slow_noise_variables(OwnNoise(found.last.residual, None).slow_std())
+    slow = slow_noise_variables(OwnNoise(found.told.residual, None).slow_std())
     found = inquiry.on_every_sample(found)
     first, last, record = found.first, with_colour(found.record, found.last, how), found.record
     calibration, errors = calibrated(last.fit), {}
@@ -118,7 +118,7 @@ def close_loop(
         calibration = labelled(calibration, doubt)
     outcome = {
         "declared": ["linear", *(a.name for a in begin)],
-        "noise_floor_nT": float(last.residual.scale),
+        "noise_floor_nT": float(found.told.residual.scale),
     } | inquiry.told(found)
     outcome |= {"unexplained": left, "held_out": {"before": before, "after": after}}
     if doubt is not None:

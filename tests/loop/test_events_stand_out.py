@@ -13,8 +13,8 @@ from scipy.signal import lfilter
 from magtensor.loop.gates import ALPHA, Candidate
 from magtensor.loop.model import Record
 from magtensor.loop.outcome import why
+from magtensor.loop.rounds import with_lines
 from magtensor.loop.screening import candidates_of
-from magtensor.loop.search import with_lines
 from magtensor.registry import Registry
 
 EVENTS = ("reference_step", "passing_source", "scale_step")

@@ -15,8 +15,8 @@ from magtensor.loop.evidence import Whitened
 from magtensor.loop.gates import ALPHA, Candidate
 from magtensor.loop.model import Adopted
 from magtensor.loop.outcome import why
+from magtensor.loop.rounds import with_lines
 from magtensor.loop.screening import candidates_of
-from magtensor.loop.search import with_lines
 from magtensor.loop.terms import Terms
 from magtensor.registry import Registry
 

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from loop_cases import BASE, adopted_names, scenario, verdict_of
 
-from magtensor.loop import rivals, search
+from magtensor.loop import rivals, rounds
 from magtensor.loop.model import Adopted, Fitting, Record, State
 from magtensor.registry import Registry
 
@@ -24,9 +24,9 @@ def test_what_is_dropped_at_once_does_not_end_the_search(tmp_path: Path, monkeyp
         if first:
             return state, ()
         first.append(state.adopted[-1].name)
-        return search.without_models(record, state, [len(state.adopted) - 1], how), (first[0],)
+        return rounds.without_models(record, state, [len(state.adopted) - 1], how), (first[0],)
 
-    monkeypatch.setattr(search, "eliminate", strict)
+    monkeypatch.setattr(rounds, "eliminate", strict)
     survey = scenario(33, *EFFECTS, motion=BASE["motion"] | {"duration_s": 600.0})
     told = verdict_of(tmp_path, survey, models=[str(e["type"]) for e in EFFECTS])
 

@@ -12,8 +12,9 @@ from magtensor.loop.adopting import on_those_that_show
 from magtensor.loop.model import Adopted, Fitting, Record, joint_state
 from magtensor.loop.outcome import judgement
 from magtensor.loop.record import origin
+from magtensor.loop.rounds import with_lines
 from magtensor.loop.screening import candidates_of
-from magtensor.loop.search import search, with_lines
+from magtensor.loop.search import search
 from magtensor.registry import Registry
 
 SAMPLES = 1500

@@ -16,8 +16,8 @@ from magtensor.loop.evidence import grams
 from magtensor.loop.gates import ALPHA, Candidate
 from magtensor.loop.model import State
 from magtensor.loop.own_noise import OwnNoise, smoothed_spectrum
+from magtensor.loop.rounds import with_lines
 from magtensor.loop.screening import candidates_of
-from magtensor.loop.search import with_lines
 from magtensor.loop.statistics import family_p
 from magtensor.registry import Registry
 

@@ -9,7 +9,7 @@ import pytest
 from loop_cases import Array, linear_state, synthetic
 
 from magtensor.loop.found import Search
-from magtensor.loop.model import Record
+from magtensor.loop.model import Fitting, Record
 from magtensor.loop.predictable import converter_words
 from magtensor.loop.unexplained import loud_words, unexplained
 from magtensor.verdict import sentence
@@ -19,7 +19,7 @@ SAMPLES = 3000
 
 def told(record: Record) -> dict[str, object]:
     state = linear_state(record)
-    return unexplained(Search(state, state, (), {}, {}, record, None), record)
+    return unexplained(Search(state, state, (), {}, {}, record, None, Fitting()), record)
 
 
 def converted(shape: str, seed: int, size: float = 0.4) -> Record:

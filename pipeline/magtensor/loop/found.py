@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 from magtensor.loop.gates import Candidate
 from magtensor.loop.latent import Sought
-from magtensor.loop.model import Record, State
+from magtensor.loop.model import Fitting, Record, State
 
 
 @dataclass(frozen=True)
@@ -20,6 +20,7 @@ class Step:
         rivals: names of models that the data do not separate from it.
         dropped: models dropped after the refit.
         refused: model -> why it was not kept after it had been fitted.
+        among: the sensors looked at, where some that wander were left out; () where all were.
     """
 
     before: State
@@ -28,6 +29,7 @@ class Step:
     rivals: tuple[str, ...] = ()
     dropped: tuple[str, ...] = ()
     refused: Mapping[str, str] = field(default_factory=dict)
+    among: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -41,6 +43,8 @@ class Search:
         failed: model -> why its regressors could not be made.
         record: the samples, with the waveform of a source that nobody logged where one was adopted.
         shared: the waveform that the sensors share after all that was adopted; None where it cannot be asked for.
+        how: how the fit of the last state was made.
+        evenly: that state with the sensors weighed by their white noise, where they were weighed by all (`wandering`).
     """
 
     first: State
@@ -50,3 +54,10 @@ class Search:
     failed: Mapping[str, str]
     record: Record
     shared: Sought | None
+    how: Fitting
+    evenly: State | None = None
+
+    @property
+    def told(self) -> State:
+        """The state by which it is told what is left."""
+        return self.evenly or self.last

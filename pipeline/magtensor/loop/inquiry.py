@@ -26,8 +26,10 @@ from magtensor.loop.outcome import described
 from magtensor.loop.own_fit import at_their_own_fit
 from magtensor.loop.profiling import repeatable
 from magtensor.loop.record import record_of
+from magtensor.loop.rounds import with_lines
 from magtensor.loop.screening import candidates_of
-from magtensor.loop.search import search, with_lines
+from magtensor.loop.search import search
+from magtensor.loop.wandering import unweighed
 from magtensor.survey.model import Survey
 
 PERSON, LOOP, DECLARED = "person", "loop", "declared"
@@ -39,7 +41,7 @@ class Moment:
 
     Attributes:
         record: the samples, with the waveform of an adopted source that nobody logged.
-        state: the fit with all that is adopted.
+        state: the fit with all that is adopted; how: it was made.
         by: who put each of the adopted models there: declared, loop or person.
         steps: the rounds so far, of the loop and by hand.
         made: decisions so far, each with what the loop computed of it.
@@ -50,6 +52,7 @@ class Moment:
 
     record: Record
     state: State
+    how: Fitting
     by: tuple[str, ...]
     steps: tuple[Step, ...] = ()
     made: tuple[tuple[Decision, str], ...] = ()
@@ -89,7 +92,7 @@ class Inquiry:
         """Where it stands; the first fit is made when it is first asked for."""
         if not self._history:
             state = joint_state(self._part.record, self.declared, self.how)
-            self._history.append(Moment(self._part.record, state, (DECLARED,) * len(self.declared)))
+            self._history.append(Moment(self._part.record, state, self.how, (DECLARED,) * len(self.declared)))
         return self._history[-1]
 
     @property
@@ -165,7 +168,7 @@ class Inquiry:
             models = [m for m in self.open_models() if m.name != NAME]
             state = with_lines(self.now.state, self.now.record, self._part.lines)
             found = candidates_of(state, models, failed, self.alpha)
-            self._ranked = tuple(at_their_own_fit(found, self.now.record, state, self.how))
+            self._ranked = tuple(at_their_own_fit(found, self.now.record, state, self.now.how))
             self._history[-1] = replace(self.now, failed={**(self.now.failed or {}), **failed})
         return self._ranked
 
@@ -179,10 +182,10 @@ class Inquiry:
         decision = Decision("adopt", name, given)
         before = self.now
         if name == NAME:
-            done = by_hand.source_adopted(before.record, before.state, component, self.how)
+            done = by_hand.source_adopted(before.record, before.state, component, before.how)
             return self._advance(decision, done, (*before.by, PERSON))
         chosen = self._candidate(component, given)
-        done = by_hand.adopted(before.record, before.state, chosen, self.ranking(), self.how)
+        done = by_hand.adopted(before.record, before.state, chosen, self.ranking(), before.how)
         return self._advance(decision, done, (*before.by, PERSON))
 
     def reject(self, name: str) -> str:
@@ -202,7 +205,7 @@ class Inquiry:
             told = self._words_of(component)
             rejected = {**(before.rejected or {}), name: told}
             return self._advance(decision, ByHand(told, before.record, before.state, None), before.by, rejected)
-        done = by_hand.taken_out(before.record, before.state, places, self.how)
+        done = by_hand.taken_out(before.record, before.state, places, before.how)
         rejected = {**(before.rejected or {}), name: done.told}
         return self._advance(decision, done, tuple(b for i, b in enumerate(before.by) if i not in places), rejected)
 
@@ -217,16 +220,16 @@ class Inquiry:
         closed = {*leaving, *((before.rejected or {}) if before else ())}
         models = [m for m in self.models if m.name not in closed]
         found = search(
-            record, models, self.how, declared=begin, most_effects=self.most_effects, alpha=self.alpha,
-            lines=self._part.lines,
+            record, models, self.how if before is None else before.how, declared=begin,
+            most_effects=self.most_effects, alpha=self.alpha, lines=self._part.lines,
         )  # fmt: skip
         if before is None:
-            before = Moment(self._part.record, found.first, (DECLARED,) * len(self.declared))
+            before = Moment(self._part.record, found.first, self.how, (DECLARED,) * len(self.declared))
             self._history.append(before)
         names = [a.name for a in found.last.adopted[len(begin) :]]
         told = f"adopted {', '.join(names)}" if names else "nothing to adopt"
         moment = Moment(
-            found.record, found.last, (*before.by, *(LOOP for _ in names)), (*before.steps, *found.steps),
+            found.record, found.last, found.how, (*before.by, *(LOOP for _ in names)), (*before.steps, *found.steps),
             (*before.made, (Decision("loop", without=tuple(leaving)), told)), before.rejected,
             {**(before.failed or {}), **found.failed}, found,
         )  # fmt: skip
@@ -241,15 +244,16 @@ class Inquiry:
         if ended is not None:
             return replace(ended, first=self.first, steps=now.steps, not_tested=not_tested, failed=now.failed or {})
         last = joint_state(
-            now.record, now.state.adopted, replace(self.how, searching=False), now.state.theta, now.state.lines
+            now.record, now.state.adopted, replace(now.how, searching=False), now.state.theta, now.state.lines
         )
         steps = (*now.steps, Step(now.state, self.ranking(), None))  # a last look, as the loop takes one
         shared = sought(last, now.record)
-        return Search(self.first, last, steps, not_tested, self.now.failed or {}, now.record, shared)
+        evenly = unweighed(now.record, last, now.how)
+        return Search(self.first, last, steps, not_tested, self.now.failed or {}, now.record, shared, now.how, evenly)
 
     def on_every_sample(self, found: Search) -> Search:
         """The search as it stands, its calibrations fitted to all samples."""
-        return on_every_sample(found, self.whole, self._part, self.how)
+        return on_every_sample(found, self.whole, self._part)
 
     def told(self, found: Search) -> dict[str, Any]:
         """`adopted`, `rejected`, `not_tested`, `steps` of the verdict and, where a person had a hand, `decisions`."""
@@ -281,7 +285,7 @@ class Inquiry:
             rejected = {n: w for n, w in (before.rejected or {}).items() if n != decision.error_model}
         steps = before.steps if done.step is None else (*before.steps, done.step)
         made = (*before.made, (decision, done.told))
-        self._history.append(Moment(done.record, done.state, by, steps, made, rejected, before.failed))
+        self._history.append(Moment(done.record, done.state, before.how, by, steps, made, rejected, before.failed))
         self._ranked = None
         return done.told
 

@@ -17,6 +17,7 @@ from magtensor.loop.found import Search
 from magtensor.loop.latent import renewed
 from magtensor.loop.model import Adopted, Fitting, Record, joint_state
 from magtensor.loop.spectrum import spectral_lines
+from magtensor.loop.wandering import unweighed
 
 MOST_SEARCHED = 40_000  # samples
 
@@ -46,12 +47,15 @@ def part_of(record: Record, declared: Sequence[Adopted], how: Fitting, most: int
     return Part(record.at(np.arange(step // 2, len(record.time), step)), every.fit, lines)
 
 
-def on_every_sample(found: Search, whole: Record, part: Part, how: Fitting) -> Search:
+def on_every_sample(found: Search, whole: Record, part: Part) -> Search:
     """The search with its calibrations fitted to all samples of the survey."""
     if part.alone is None:
         return found
     if found.record.waveform is not None:
         whole = replace(whole, waveform=np.interp(whole.time, found.record.time, found.record.waveform))
-    last = joint_state(whole, found.last.adopted, replace(how, searching=False), found.last.theta, found.last.lines)
-    whole, last = renewed(whole, last, how)
-    return replace(found, first=replace(found.first, fit=part.alone), last=last, record=whole)
+    last = joint_state(
+        whole, found.last.adopted, replace(found.how, searching=False), found.last.theta, found.last.lines
+    )
+    whole, last = renewed(whole, last, found.how)
+    first = replace(found.first, fit=part.alone)
+    return replace(found, first=first, last=last, record=whole, evenly=unweighed(whole, last, found.how))

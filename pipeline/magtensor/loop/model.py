@@ -280,11 +280,26 @@ def joint_state(
             raw, reference = without(record, each, theta)
             fit = _fit(record, raw, reference, how, keep)
             x = beside_the_site(excitation_of(record, fit, raw, lines), adopted, theta)
+    return _state(record, adopted, theta, fit, raw, reference, how, x, estimate, lines)
+
+
+def _state(
+    record: Record,
+    adopted: Sequence[Adopted],
+    theta: Sequence[Array],
+    fit: JointFit,
+    raw: Array,
+    reference: Array | None,
+    how: Fitting,
+    x: Excitation,
+    estimate: Estimate | None,
+    lines: Sequence[float],
+) -> State:
+    """What a fit of outputs and total field, with the effects taken off, leaves."""
     entire = residual_of(fit, raw, reference, how.reference_noise)
     entire = replace(entire, time=record.time[entire.samples])
     residual = quick(entire)
-    if adopted:
-        terms = joined([a.terms(x) for a in adopted]).at(residual.samples)
+    terms = joined([a.terms(x) for a in adopted]).at(residual.samples) if adopted else None
     left_out = None if residual is entire else entire
     return State(tuple(adopted), tuple(theta), fit, residual, x, terms, estimate, tuple(lines), left_out)
 
@@ -351,6 +366,15 @@ def _fit(
         return fit
     more = (borne_out if how.searching else louder)(fit, raw, reference, how.reference_noise)
     return fit if np.array_equal(more, fit.keep) else fitted(more)
+
+
+def reweighed(record: Record, state: State, how: Fitting) -> State:
+    """The state with C and o fitted as `how` says, and its coefficients as they are."""
+    each = [a.terms(state.excitation) for a in state.adopted]
+    raw, reference = without(record, each, state.theta)
+    fit = _fit(record, raw, reference, how, None)
+    x = beside_the_site(excitation_of(record, fit, raw, state.lines), state.adopted, state.theta)
+    return _state(record, state.adopted, state.theta, fit, raw, reference, how, x, state.estimate, state.lines)
 
 
 def require_determined(record: Record, state: State, how: Fitting) -> None:

@@ -39,6 +39,7 @@ def _step(number: int, step: Step) -> dict[str, Any]:
         "indistinguishable_from": list(step.rivals),
         "dropped": list(step.dropped),
         "refused": dict(step.refused),
+        **({"among": list(step.among)} if step.among else {}),
         "looked_at": [
             judgement(c) | {"why": "adopted" if c is step.adopted else why(c, step.adopted)} for c in step.candidates
         ],

@@ -95,7 +95,7 @@ def _part_of_a_source(found: Search, fixed: int) -> tuple[list[int], str] | None
 def staying(found: Search) -> float:
     """nT rms above the white noise that stays and may follow the attitude: without what the best of the significant
     effects of something else would explain that a gate refused, as one that happened once and predicts nothing."""
-    state, residual = found.last, found.last.residual
+    state, residual = found.told, found.told.residual
     other = 0.0
     for candidate in found.steps[-1].candidates if found.steps else ():
         if max(candidate.adjusted_p, candidate.adjusted_null_p) >= candidate.alpha:

@@ -38,7 +38,7 @@ NOISE = "what is left is noise: white, and slow noise of each sensor alone or of
 
 def unexplained(found: Search, record: Record) -> dict[str, Any]:
     """The `unexplained` block of the contract."""
-    state = found.last
+    state = found.told
     excess = excess_rms(state)
     last = found.steps[-1].candidates if found.steps else ()
     seen = [

@@ -1,0 +1,267 @@
+"""The rounds of a search: the best candidate that passes is adopted, everything is refitted, and so on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+from magtensor.components import Component
+from magtensor.errors import DataError
+from magtensor.loop.adopting import adopt, narrowed, polished
+from magtensor.loop.changing_matrix import channel_instead
+from magtensor.loop.contribution import agrees, eliminate, happens_once, of_all_alike, without_models
+from magtensor.loop.exchange import looked_at_again, simpler
+from magtensor.loop.excitation import Excitation
+from magtensor.loop.found import Step
+from magtensor.loop.gates import Candidate
+from magtensor.loop.latent import NAME, Sought, Source, renewed, sought, tried_source
+from magtensor.loop.log_noise import channels_of
+from magtensor.loop.model import Fitting, Record, State, generic
+from magtensor.loop.needs import missing
+from magtensor.loop.own_fit import at_their_own_fit
+from magtensor.loop.profiling import already, repeatable
+from magtensor.loop.rivals import containing, hardly_begun, simplest
+from magtensor.loop.screening import candidates_of
+from magtensor.loop.spectrum import spectral_lines
+from magtensor.loop.trial import Trial, on_the_folds_of, per_sample, trial
+
+ROUNDING = 1e-4  # mean square of the whitened residual: far below the least noise that any sensor is believed to have
+
+
+@dataclass(frozen=True)
+class Ended:
+    """Where rounds of a search ended: nothing more is adopted.
+
+    Attributes:
+        record: as in `Search`; state: the fit with all that was adopted; how: it was made.
+        steps: in order; shared: the waveform that the sensors share.
+    """
+
+    record: Record
+    state: State
+    how: Fitting
+    steps: tuple[Step, ...]
+    shared: Sought | None
+
+    @property
+    def adopts(self) -> bool:
+        """Whether anything was adopted."""
+        return any(step.adopted is not None for step in self.steps)
+
+
+@dataclass
+class Rounds:
+    """The rounds of a search, in each of which an effect is adopted.
+
+    Attributes:
+        models, most_effects, alpha, lines, say: as in `search`; fixed: how many models were declared.
+        failed: model -> why its regressors could not be made.
+    """
+
+    models: Sequence[Component]
+    fixed: int
+    most_effects: int
+    alpha: float
+    lines: Sequence[float] | None
+    say: Callable[[str], None] | None
+    failed: dict[str, str] = field(default_factory=dict)
+
+    def candidates(self, state: State, record: Record, how: Fitting) -> list[Candidate]:
+        """What may be adopted beside what is."""
+        open_ = open_models(testable(state.excitation, self.models), state)
+        return at_their_own_fit(candidates_of(state, open_, self.failed, self.alpha), record, state, how)
+
+    def run(self, record: Record, state: State, how: Fitting) -> Ended:
+        """Adopt the best, refit, repeat, until nothing is left that the data want."""
+        hidden = next((m for m in self.models if m.name == NAME), None)
+        shared: Sought | None = None
+        standing = trial(record, state, how)
+        steps: list[Step] = []
+        asked = False  # whether something simpler does as well
+        for _ in range(self.most_effects + 2):
+            state = with_lines(state, record, self.lines)
+            if len(state.adopted) - self.fixed >= self.most_effects or state.residual.square() < ROUNDING:
+                break
+            candidates = self.candidates(state, record, how)
+            adopted = _first_kept(record, standing, candidates, how, self.fixed, self.say)
+            steps.append(Step(state, tuple(candidates), *adopted.step))
+            if adopted.standing is not None:
+                record, state = renewed(record, adopted.standing.state, how)
+                standing = replace(adopted.standing, state=state)
+                continue
+            open_ = len(testable(state.excitation, self.models))
+            exchanged = None if asked else _exchanged(record, state, steps, how, self.fixed, open_)
+            asked = True
+            if exchanged is not None:
+                after, step = exchanged
+                if self.say is not None and step.adopted is not None:
+                    self.say(f"{step.adopted.model.name} takes the place of {', '.join(step.refused)}")
+                steps[-1] = step
+                record, state = renewed(record, after.state, how)
+                standing = replace(after, state=state)
+                continue
+            shared = sought(state, record)
+            if shared is None or hidden is None or NAME in {a.name for a in state.adopted}:
+                break
+            shared, source = tried_source(hidden, record, state, shared, how, self.alpha)
+            instead = None
+            if source is None and shared.left_by:
+                instead = shared.left_by
+                source = _source_instead(hidden, record, state, shared, how, self.fixed, self.alpha)
+            if source is None:
+                break
+            if self.say is not None:
+                self.say(f"adopting {NAME}")
+            record, state, shared = source.record, source.after, None
+            last, dropped = eliminate(record, state, how, self.fixed)
+            if dropped and NAME not in dropped:  # what had taken a part of the source for its own
+                record, state = renewed(record, last, how)
+            gone = (*([instead] if instead else []), *(() if NAME in dropped else dropped))
+            steps[-1] = replace(steps[-1], adopted=source.evidence, dropped=gone)
+            standing = trial(record, state, how)
+        return Ended(record, state, how, tuple(steps), shared)
+
+
+def _exchanged(
+    record: Record, state: State, steps: Sequence[Step], how: Fitting, fixed: int, models: int
+) -> tuple[Trial, Step] | None:
+    """The fit with a simpler model in the place of an adopted one that it does as well as, and the round's story."""
+    found = simpler(state, steps, fixed)
+    if found is None:
+        return None
+    place, other = found
+    old = state.adopted[place].name
+    without = without_models(record, state, [place], how)
+    chosen = looked_at_again(without, other, models)
+    if chosen is None:
+        return None
+    after, _ = _kept(record, trial(record, without, how), chosen, how)
+    if after is None:
+        return None
+    why = f"{chosen.model.name}, which has fewer coefficients, does as well beside the others"
+    return after, Step(without, (chosen,), chosen, (old,), refused={old: why})
+
+
+def _source_instead(
+    component: Component, record: Record, state: State, left: Sought, how: Fitting, fixed: int, alpha: float
+) -> Source | None:
+    """A source nobody logged in the place of the adopted effect that has the same vectors at the sensors: of something
+    that switches now and then a single step is a part, and so is what channels show that feel it late. None where it
+    does not do better.
+
+    Parameters
+    ----------
+    left: what the effect leaves.
+    """
+    places = [i for i, a in enumerate(state.adopted) if a.name == left.left_by and i >= fixed]
+    if not places:
+        return None
+    less = without_models(record, state, places, how)
+    tried = left.significant and all(generic(state.adopted[i]) for i in places)
+    shared = sought(less, record, may_follow=tried)
+    source = None if shared is None else tried_source(component, record, less, shared, how, alpha)[1]
+    if source is None or source.after.fit.keep.sum() < state.fit.keep.sum():
+        return None
+    return source if per_sample(source.after) > per_sample(state) else None
+
+
+@dataclass(frozen=True)
+class _Kept:
+    """The outcome of a round; `standing` is None where nothing was kept."""
+
+    standing: Trial | None
+    chosen: Candidate | None = None
+    rivals: tuple[str, ...] = ()
+    dropped: tuple[str, ...] = ()
+    refused: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def step(self) -> tuple[Candidate | None, tuple[str, ...], tuple[str, ...], Mapping[str, str]]:
+        return self.chosen, self.rivals, self.dropped, self.refused
+
+
+def _first_kept(
+    record: Record,
+    before: Trial,
+    candidates: Sequence[Candidate],
+    how: Fitting,
+    fixed: int,
+    say: Callable[[str], None] | None,
+) -> _Kept:
+    """Fit the candidates that pass, the best first, until one is kept."""
+    refused: dict[str, str] = {}
+    while passing := [c for c in candidates if c.passes and c.model.name not in refused]:
+        best = max(passing, key=lambda c: c.assessment.gain.total)
+        possible = [c for c in candidates if c.predicts and c.model.name not in refused]
+        best = containing(best, possible, before.state)
+        chosen, rivals = simplest(best, possible, before.state)
+        if say is not None:
+            say(f"adopting {chosen.model.name}")
+        after, why = _kept(record, before, chosen, how)
+        if after is None:
+            refused[chosen.model.name] = why
+            continue
+        last, dropped = eliminate(record, after.state, how, fixed)
+        if dropped:
+            after = trial(record, last, how)
+        if chosen.model.name in dropped and len(last.adopted) <= len(before.state.adopted):
+            refused[chosen.model.name] = "fitted, it does not earn its place on held-out blocks"
+            continue
+        return _Kept(after, chosen, rivals, dropped, refused)
+    return _Kept(None, refused=refused)
+
+
+def _kept(record: Record, before: Trial, chosen: Candidate, how: Fitting) -> tuple[Trial | None, str]:
+    """The fit with a model, on fewer sensors where it hurts one that it does not help; None, and why, if it fails."""
+    try:
+        after = trial(record, polished(record, adopt(record, before.state, chosen, how), how), how)
+    except DataError as error:  # with coefficients that run away nothing is left to calibrate
+        return None, f"it cannot be fitted: {error.what.split(':')[0]}"
+    before = on_the_folds_of(after, record, before, how)
+    hurt, which = before.hurt_by(after), len(before.state.adopted)
+    if hurt:
+        own = after.state.adopted[which].sensors or tuple(record.sensors)
+        helped = [s for s in before.helped_by(after) if s in own]
+        if helped and set(chosen.terms.sensors) >= set(own):
+            after = trial(record, narrowed(record, after.state, which, tuple(helped), how), how)
+            before = on_the_folds_of(after, record, before, how)
+            hurt = before.hurt_by(after)
+    if hurt:
+        return None, f"fitted, it raises the held-out error of {', '.join(hurt)}"
+    model = after.state.adopted[which]
+    acts_on = model.sensors or tuple(record.sensors)
+    same = [a for a in after.state.adopted[:which] if set(a.sensors or record.sensors) & set(acts_on)]
+    if not channels_of(model, after.state.excitation) and already(same, model.component, model.settings):
+        return None, "fitted, its settings are those of what is adopted already"
+    slow, channels = hardly_begun(chosen, after.state.excitation), sorted(channels_of(model, after.state.excitation))
+    if (slow or channels) and of_all_alike(after.state, which):
+        drift = "drifts" if slow else f"follows {' and '.join(channels)}"
+        return None, f"fitted, all sensors show it alike: an error of the base station that {drift} would look the same"
+    if not agrees(after.state, which):
+        return None, "fitted, its coefficients are not what its settings assume"
+    if not before.likelier(after):
+        return None, "fitted together with the others, it leaves more than it takes away"
+    if happens_once(model):
+        terms = chosen.terms.only(i for i, s in enumerate(chosen.terms.sensors) if s in acts_on)
+        if channel := channel_instead(before.state, terms, chosen.assessment.colours):
+            why = f"C of {', '.join(acts_on)} follows {channel}, which explains more than something that happens once"
+            return None, why
+    return after, ""
+
+
+def testable(x: Excitation, models: Sequence[Component]) -> list[Component]:
+    """The models that have what they need, beside what is adopted."""
+    return [m for m in models if not missing(m, x)]
+
+
+def open_models(testable: Sequence[Component], state: State) -> list[Component]:
+    """Those that are not in already, or can be in more than once."""
+    taken = {a.name for a in state.adopted}
+    return [m for m in testable if m.name not in taken or repeatable(m)]
+
+
+def with_lines(state: State, record: Record, lines: Sequence[float] | None = None) -> State:
+    """The state, its excitation knowing the strongest lines in the spectrum of what is left, or those given."""
+    if lines is None:
+        lines = [f for f, _, _ in spectral_lines(state.residual, record.time[state.residual.samples])]
+    return replace(state, excitation=replace(state.excitation, lines=tuple(lines)))
