@@ -51,7 +51,9 @@ every recipe.
   `sensed` (what the sensors make of a vector).
 - It returns `Terms`, most simply by `x.offsets` (a series on every axis), `x.scales` (a series times each axis's own
   output), `x.responses` (a series for each axis), `x.matrices` (a vector through nine coefficients a sensor),
-  `x.one_each` (one coefficient a sensor), `x.shared` (one for all), `x.on_reference`; `joined` puts several together.
+  `x.one_each` (one coefficient a sensor), `x.shared` (one for all), `x.on_reference`; of a vector that sensors see,
+  times a course, `x.one_each_sensing` and `x.shared_sensing` are the same at a fraction of the cost; `joined` puts
+  several together.
 - Keyword parameters are settings: a type, how it is profiled (`Range`, `Choice`, `Forms`, `Beginning`, `AnyChannel`,
   `EventTimes`, `Frequencies`, `Duration`), a description, and a default.
 - `needs` names what it cannot do without: channels (`current_*`), `attitude`, `position`, `total_field`, `rotation`

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
@@ -21,6 +21,8 @@ from magtensor.survey.model import Survey, Variable
 from magtensor.verdict import WORSE, survey_block
 
 if TYPE_CHECKING:
+    from magtensor.calibration.types import ArrayCalibration
+    from magtensor.loop.model import Adopted
     from magtensor.platform_frame import Tied
 
 
@@ -93,6 +95,7 @@ def apply(
     attributes = found["calibrated/b"].attrs if "calibrated/b" in found else {}
     each = {
         "NOT taken off": "not_taken_off",
+        "total field as it was read, which fits better than without": "total_field_as_read",
         "extrapolated": "extrapolated",
         "begins anew with this survey": "begins_anew",
         "NOT taken off, for the lengths of this survey's vectors refute it": "not_on_this_survey",
@@ -217,7 +220,12 @@ def apply_and_refine(
             "begins_anew": begun_anew(adopted, calibration),
             "not_on_this_survey": here.refuted,
         }
-        survey = survey.merged(_named(corrected(fitted, survey, **words), calibration, dated, apart))
+        given = corrected(fitted, survey, **words)
+        if rows is None and (as_read := _better_as_read(before, survey, fitted, adopted)) is not None:
+            survey = as_read
+            names = ", ".join(a.name for a in adopted if a.component.effect == "reference")
+            given = corrected(fitted, survey, **words, total_field_as_read=names)
+        survey = survey.merged(_named(given, calibration, dated, apart))
         if refine_rotation:
             survey, turned = with_refined_rotation(survey, calibration, fitted)
             if turned is not None:  # as it is kept, it holds the scatter beside the covariance
@@ -266,12 +274,8 @@ def _told(attributes: Mapping[str, Any]) -> str:
 def verification(calibrated: Survey, path: Path | Held, planned: Plan) -> dict[str, Any]:
     """The error blocks of another survey: with the declared model alone, and with all that was adopted.
 
-    An error of the base station may have ended with its own survey, or another station was there: if this survey's
-    total field fits clearly better as it was read, it is judged by that, and `total_field_as_read` names what was left
-    in.
+    `total_field_as_read` names errors of the base station that were left in (`_better_as_read`).
     """
-    from magtensor.loop.stored import stored_effects
-
     corrected = apply_to(calibrated, path, planned, uniform=True)
     after = survey_block(corrected)
     before = after
@@ -279,18 +283,23 @@ def verification(calibrated: Survey, path: Path | Held, planned: Plan) -> dict[s
         alone = apply_to(with_declared_alone(calibrated), path, planned, judge=False)
         before = survey_block(alone.merged({"good": corrected["good"]}))  # the same samples
     found: dict[str, Any] = {"before": before, "after": after}
-    if left := corrected["calibrated/b"].attrs.get("not_taken_off"):
-        found["not_taken_off"] = left
-    of_reference = [
-        a.name for a in stored_effects(calibrated, planned.registry)[0] if a.component.effect == "reference"
-    ]
-    if of_reference:
-        as_read = load_as(planned, path)["total_field"]
-        given = (["time"], as_read.values, dict(as_read.attrs))
-        block = survey_block(corrected.merged({"total_field": given}))
-        if WORSE * _total_field_error(block) < _total_field_error(after):
-            found |= {"after": block, "total_field_as_read": ", ".join(of_reference)}
-    return found
+    attributes = corrected["calibrated/b"].attrs
+    return found | {name: attributes[name] for name in ("not_taken_off", "total_field_as_read") if name in attributes}
+
+
+def _better_as_read(
+    before: Survey, cleaned: Survey, fitted: ArrayCalibration, adopted: Sequence[Adopted]
+) -> Survey | None:
+    """The survey with its total field as it was read, if that fits clearly better than without the errors of the base
+    station that the calibration holds: they may have ended with its own survey, or another station was there."""
+    from magtensor.calibrated import corrected
+
+    if "total_field" not in cleaned or not any(a.component.effect == "reference" for a in adopted):
+        return None
+    as_read = before["total_field"]
+    other = cleaned.merged({"total_field": (("time",), as_read.values, dict(as_read.attrs))})
+    errors = [_total_field_error(survey_block(s.merged(corrected(fitted, s)))) for s in (other, cleaned)]
+    return other if WORSE * errors[0] < errors[1] else None
 
 
 def _total_field_error(block: dict[str, Any] | None) -> float:

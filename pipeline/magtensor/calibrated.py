@@ -96,7 +96,7 @@ def corrected(calibration: ArrayCalibration, survey: Survey, **words: str) -> di
     `words` become attributes where they say something: `not_taken_off` names effects that are still in it,
     `extrapolated` those taken off beyond what the calibration has seen, `begins_anew` those of a time that goes on from
     the calibration's survey to another one as a rule, and with this one began again, `not_on_this_survey` those that
-    the survey's own outputs refute.
+    the survey's own outputs refute, `total_field_as_read` those of the base station that were left in its total field.
     """
     raw = np.asarray(survey.values("b_raw"), dtype=float)
     b = calibration.apply(raw)

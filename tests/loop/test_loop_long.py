@@ -30,7 +30,7 @@ def found_in_a_part(folder: Path, *names: str, **effect: object) -> Search:
     registry = Registry.load()
     models = [registry.find("error_model", name) for name in names]
     found = search(part.record, models, HOW, lines=part.lines)
-    whole = on_every_sample(found, record, part, HOW)
+    whole = on_every_sample(found, record, part)
     assert len(whole.last.residual.affine) > 0.99 * len(record.time)
     assert not unexplained(found, found.record)["present"]
     return whole

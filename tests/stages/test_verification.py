@@ -12,6 +12,7 @@ import h5py
 import pytest
 
 from magtensor import close_loop, provenance
+from magtensor.applying import apply
 from magtensor.batch.freshness import why_run
 from magtensor.cli import status_of
 from magtensor.errors import DataError
@@ -181,7 +182,8 @@ def test_an_error_of_the_base_station_that_has_ended_is_not_taken_off(tmp_path: 
     ):
         write(simulate(survey | one), tmp_path / name)
     options = {"search": ["reference_clock", "reference_scale"]}
-    ended = close_loop(tmp_path / "late.h5", verify=tmp_path / "right.h5", **options).verdict
+    found = close_loop(tmp_path / "late.h5", verify=tmp_path / "right.h5", **options)
+    ended = found.verdict
     goes_on = close_loop(tmp_path / "late.h5", verify=tmp_path / "too.h5", **options).verdict
     for told in (ended, goes_on):
         assert [a["error_model"] for a in told["adopted"]] == ["reference_clock"]
@@ -193,3 +195,11 @@ def test_an_error_of_the_base_station_that_has_ended_is_not_taken_off(tmp_path: 
     assert ended["error"]["verify"]["total_field_as_read"] == "reference_clock"
     assert "judged as it was read" in sentence(ended)
     assert "total_field_as_read" not in goes_on["error"]["verify"]
+
+    stored = found.calibration.save(tmp_path / "calibration.nc")
+    right, too = (apply(stored, tmp_path / name) for name in ("right.h5", "too.h5"))
+    assert any("as it was read" in note and "reference_clock" in note for note in right.notes)
+    assert not any("as it was read" in note for note in too.notes)
+    for one in (right, too):
+        nT = float(one.sentence.split("|b| - F: ")[1].split()[0])
+        assert nT == pytest.approx(0.2, abs=0.06)

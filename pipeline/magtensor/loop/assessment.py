@@ -55,7 +55,7 @@ def _along(residual: Residual, along: Array, across: Colour, stiff: bool) -> Col
         excess, share = excess_of(across, modes.most), across.white / plain.white
     if not len(excess):
         return plain
-    turned = TurnedColour(modes.slowest(len(excess)), np.repeat(excess * share, 3), Colour(None, 1.0))
+    turned = TurnedColour(modes, np.repeat(excess * share, 3), Colour(None, 1.0))
     return replace(turned, rest=colour_of(turned.still(along)[:, None], stiff=stiff))
 
 

@@ -23,6 +23,7 @@ from magtensor.loop.model import Adopted, Fitting, Record, State, joint_state, o
 from magtensor.loop.needs import missing
 from magtensor.loop.overshadowed import overshadowed
 from magtensor.loop.rounds import Ended, Rounds, with_lines
+from magtensor.loop.trial import on_the_folds_of, trial
 from magtensor.loop.wandering import all_noise, narrowed_to, of_sensors, quieter, unweighed
 
 MOST_EFFECTS = 8
@@ -88,25 +89,44 @@ def search(
 
 
 def _without_those_that_wander(ended: Ended, rounds: Rounds) -> Ended:
-    """The search gone on among the quiet sensors alone; what they show is then fitted on all, each weighed by all of
-    its noise, and the search goes on there."""
-    for names in quieter(ended.state):
-        some = of_sensors(ended.record, names)
-        models, theta = narrowed_to(ended.state.adopted, ended.state.theta, ended.state, names)
-        among = replace(rounds, fixed=len(models), most_effects=rounds.most_effects - len(models) + rounds.fixed)
-        found = among.run(some, joint_state(some, models, ended.how, theta, ended.state.lines), ended.how)
-        if not found.adopts:
+    """The search gone on among the quiet sensors alone; what they show is then fitted on all sensors, each weighed by
+    all of its noise, and the search goes on there."""
+    settled = _settled(ended.record, ended.state, ended.how)  # what is flagged is no wandering
+    for names in quieter(settled):
+        try:
+            gone_on = _among(names, ended, rounds)
+        except DataError:  # they do not determine a calibration by themselves
             continue
-        new = slice(len(models), None)
-        more, values = narrowed_to(found.state.adopted[new], found.state.theta[new], found.state, names)
-        every, start = [*ended.state.adopted, *more], [*ended.state.theta, *values]
-        record = replace(ended.record, waveform=found.record.waveform)
-        evenly = joint_state(record, every, ended.how, start, ended.state.lines)
-        how = replace(ended.how, noise=all_noise(evenly))
-        again = rounds.run(record, joint_state(record, every, how, start, ended.state.lines), how)
-        steps = tuple(replace(step, among=names) for step in found.steps)
-        return replace(again, steps=(*ended.steps, *steps, *again.steps))
+        if gone_on is not None:
+            return gone_on
     return ended
+
+
+def _among(names: tuple[str, ...], ended: Ended, rounds: Rounds) -> Ended | None:
+    """The search gone on with what some of the sensors show by themselves; None where that is nothing, or where it does
+    not help when all are fitted.
+
+    What nothing has explained so far is no longer believed to be an effect.
+    """
+    how, lines = replace(ended.how, searching=False), ended.state.lines
+    some = of_sensors(ended.record, names)
+    models, theta = narrowed_to(ended.state.adopted, ended.state.theta, ended.state, names)
+    among = replace(rounds, fixed=len(models), most_effects=rounds.most_effects - len(models) + rounds.fixed)
+    found = among.run(some, joint_state(some, models, how, theta, lines), how)
+    if not found.adopts:
+        return None
+    new = slice(len(models), None)
+    more, values = narrowed_to(found.state.adopted[new], found.state.theta[new], found.state, names)
+    every, start = [*ended.state.adopted, *more], [*ended.state.theta, *values]
+    record = replace(ended.record, waveform=found.record.waveform)
+    how = replace(ended.how, noise=all_noise(joint_state(record, every, how, start, lines)))
+    before = trial(record, joint_state(record, ended.state.adopted, how, ended.state.theta, lines), how)
+    after = trial(record, joint_state(record, every, how, start, lines), how)
+    if on_the_folds_of(after, record, before, how).hurt_by(after) or not before.likelier(after):
+        return None
+    again = rounds.run(record, after.state, how)
+    steps = tuple(replace(step, among=names) for step in found.steps)
+    return replace(again, steps=(*ended.steps, *steps, *again.steps))
 
 
 def _settled(record: Record, state: State, how: Fitting) -> State:

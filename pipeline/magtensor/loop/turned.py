@@ -104,7 +104,7 @@ class TurnedColour:
     """Slow noise in the sensors' axes, and a stationary rest.
 
     Attributes:
-        modes: what the slow noise looks like.
+        modes: what the slow noise looks like, no more of them than have a variance.
         variance: (M,) of the columns of the modes, in the units of the squared residual over `white`.
         rest: the colour of what is left when they are filtered out.
     """
@@ -112,6 +112,9 @@ class TurnedColour:
     modes: SlowModes
     variance: Array
     rest: Colour
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "modes", self.modes.slowest(len(self.variance) // 3))
 
     @property
     def white(self) -> float:

@@ -20,7 +20,7 @@ from magtensor.loop.model import Adopted, Fitting, Record, State, reweighed
 from magtensor.loop.own_noise import OwnNoise
 
 UNEQUAL = 3.0  # all of a sensor's noise over its white noise, beside the same of the sensor that wanders least
-LEAST_SENSORS = 2  # that see one field
+LEAST_SENSORS = 3  # two have one contrast, which does not tell whose effect it is
 
 
 def quieter(state: State) -> Iterator[tuple[str, ...]]:
