@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from magtensor.calibration.common_field import common_field
 from magtensor.calibration.joint import calibrated, fit_joint
 from magtensor.calibration.noise import noise_std, shares_of_two
 from magtensor.errors import NotEnoughData
@@ -56,6 +57,17 @@ def test_a_strong_effect_is_no_lack_of_attitudes_until_the_model_is_complete() -
     planar = raw * np.array([1.0, 1.0, 0.0]) + np.array([0.0, 0.0, 1_000.0])
     with pytest.raises(NotEnoughData):
         fit_joint(planar, total_field, complete=False)
+
+
+@pytest.mark.parametrize(
+    ("noise", "known_to"), [((1.0, 30.0, 1.0, 1.0), 0.05), ((0.05, 0.5, 0.1, 1.5), 0.4), ((0.1, 3.0, 0.1), 0.1)]
+)
+def test_a_quiet_sensor_beside_loud_ones_is_known_for_quiet(noise: tuple[float, ...], known_to: float) -> None:
+    """As well as the differences tell it: two equal ones to some per cent, of 0.05 beside 0.1 the square to a half."""
+    rng = np.random.default_rng(12)
+    b = turned(rng, 6000)
+    raw = np.stack([b + s * rng.standard_normal(b.shape) for s in noise], axis=1)
+    np.testing.assert_allclose(common_field(raw).noise.reshape(-1, 3).T, [noise] * 3, rtol=known_to)
 
 
 @pytest.mark.parametrize("sensors", [3, 4, 8])

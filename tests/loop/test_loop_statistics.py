@@ -150,6 +150,17 @@ def test_a_line_is_found_and_noise_has_none() -> None:
     assert min(small) > 1e-4
 
 
+def test_a_loud_sensor_has_no_line() -> None:
+    smallest = []
+    for seed in range(20):
+        added = np.zeros((1200, 4, 3))
+        added[:, 2] = 30.0 * np.random.default_rng(seed).standard_normal((1200, 3))
+        record = synthetic(80 + seed, added=added, turning_s=20.0)
+        smallest.append(spectral_lines(linear_state(record).residual, record.time)[0][2])
+    assert min(smallest) > 1e-3  # of 20 the smallest is below that once in 50 times
+    assert np.mean(np.array(smallest) < 0.05) <= 0.2
+
+
 def test_slow_noise_on_a_platform_that_turns_is_no_line() -> None:
     """C takes a part of the noise, which then turns with the platform, here within a few samples."""
     smallest = []

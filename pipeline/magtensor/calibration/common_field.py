@@ -19,7 +19,8 @@ from magtensor.errors import MissingAttitudes
 from .types import Array, Mask
 
 LEAST_SAMPLES_PER_AXIS = 20  # below this the noise is taken as equal on all axes of the array
-LEAST_SHARE = 0.05  # of the array's mean noise variance: a smaller estimate is a Heywood case, not a quiet axis
+LEAST_SHARE = 0.05  # of its sensor's mean noise variance: a smaller estimate is a Heywood case, not a quiet axis
+QUIETEST = 1e-4  # the same of a sensor among all: noise levels differ by factors of 30, and one of zero weighs all
 _CHUNK = 65536
 
 
@@ -167,8 +168,14 @@ def _with_noise(factor: Array, count: int) -> tuple[Array, Array, Array]:
         share = 1.0 - np.sum(basis**2, axis=1)
         variance = np.diag(own) / np.maximum(share, 1e-6) * count / (count - 4)
         step = np.sqrt(np.clip(variance, 0.1, 10.0))
-        before, sd = sd, np.maximum(sd * step, np.sqrt(LEAST_SHARE * np.mean(sd**2)))
+        before, sd = sd, np.maximum(sd * step, _least(sd))
         if np.max(np.abs(sd / before - 1)) < 1e-6:
             break
     basis, own = _plane(factor / sd)
     return sd, basis, own
+
+
+def _least(sd: Array) -> Array:
+    """(3 S,), the least noise that outputs of noise (3 S,) are believed to have."""
+    own = np.mean(sd.reshape(-1, 3) ** 2, axis=1)
+    return np.sqrt(np.repeat(np.maximum(LEAST_SHARE * own, QUIETEST * own.mean()), 3))

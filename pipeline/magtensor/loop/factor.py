@@ -85,6 +85,13 @@ def with_factor(covariance: Array, basis: Array, groups: Groups, alone: Factors)
     return min(fits, key=lambda fit: fit.deviance)
 
 
+def refitted(covariance: Array, basis: Array, groups: Groups, near: Factors) -> Factors:
+    """The same model as that of a covariance nearby, from where that was found."""
+    noise = near.noise + 1e-9 * np.trace(near.noise) / len(basis) * np.eye(len(basis))
+    direction = near.direction if near.direction.any() else None
+    return _fitted(covariance, basis, groups, np.linalg.cholesky(noise), direction)
+
+
 def _fitted(covariance: Array, basis: Array, groups: Groups, start: Array, direction: Array | None) -> Factors:
     """Quasi-Newton over the triangular roots of the groups' noise and the factor's direction."""
     from scipy.optimize import minimize

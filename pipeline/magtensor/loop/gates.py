@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from magtensor.loop.assessment import BORNE_OUT, Assessment
+from magtensor.loop.assessment import BORNE_OUT, SLOWEST, Assessment
 from magtensor.loop.contribution import a_tone, happens_once
 from magtensor.loop.model import Adopted, State
 from magtensor.loop.residual import taken_off
@@ -35,7 +36,8 @@ class Candidate:
         adjusted_null_p: the same for what it explains in noise of the residual's own colour.
         alpha: what the adjusted p has to stay below.
         log_noise: what noise in the log of its channel, brought in by a model adopted before, lets it gain.
-        beside: sum of squares that the models adopted before explain to first order.
+        beside: sum of squares that the models adopted before explain to first order; kin: the same of those that have
+            its sensors and what drives it (`kin`).
         before: what it was judged against, where that is the fit with it, its part put back (`own_fit`).
     """
 
@@ -49,6 +51,7 @@ class Candidate:
     alpha: float = ALPHA
     log_noise: float = 0.0
     beside: float = 0.0
+    kin: float = 0.0
     before: State | None = None
 
     def among(self, models: int) -> Candidate:
@@ -72,18 +75,26 @@ class Candidate:
         return 0.0 < self.assessment.gain.total <= SECOND_ORDER * self.beside
 
     @property
+    def of_the_law(self) -> bool:
+        """Whether it is no more than the law of an adopted effect, which has its driver and its sensors, may miss."""
+        return 0.0 < self.assessment.gain.total <= OF_THE_LAW * self.kin
+
+    @property
     def significant(self) -> bool:
         """Whether noise does not explain it, all that was tried considered.
 
         By its p value alone. Or, because a dozen long blocks tell little of what is very unlikely, in noise of each
-        sensor's own spectrum, if the blocks bear it out as a test of this model alone. The p value of what happens once
-        is not from blocks, and of a tone that spectrum does not know that its strongest line was taken.
+        sensor's own spectrum, if the blocks bear it out: as a test of this model alone where its regressors are slow,
+        among all models where they turn with the field, for noise that turns with it (a mount that creeps) has no
+        spectrum. The p value of what happens once is not from blocks, and of a tone that spectrum does not know that
+        its strongest line was taken.
         """
         if self.adjusted_p < self.alpha:
             return True
         if happens_once(self.model) or a_tone(self.model):
             return False
-        return self.adjusted_own_p < self.alpha and self.assessment.p * self.tried < BORNE_OUT
+        by_blocks = self.assessment.p * self.tried if is_slow(self.terms) else self.adjusted_p
+        return self.adjusted_own_p < self.alpha and by_blocks < BORNE_OUT
 
     @property
     def beyond_slow_noise(self) -> bool:
@@ -98,7 +109,7 @@ class Candidate:
     @property
     def predicts(self) -> bool:
         """Whether it is significant and predicts held-out blocks, in noise of the colour of what it leaves."""
-        if self.of_the_log or self.of_second_order:
+        if self.of_the_log or self.of_second_order or self.of_the_law:
             return False
         gain = self.assessment.gain
         reduction = gain.total / max(float(gain.before.sum()), 1e-300)
@@ -128,6 +139,14 @@ class Candidate:
         return self.predicts and self.beyond_slow_noise
 
 
+def is_slow(terms: Terms) -> bool:
+    """Whether most of the power of regressors, their means left out, is in the slowest twentieth of the frequencies."""
+    from scipy.fft import dct
+
+    power = dct(terms.series, axis=0, norm="ortho")[1:] ** 2
+    return bool(power[: len(power) // SLOWEST].sum() > 0.5 * power.sum())
+
+
 def gained_of_a_log(log_noise: float, coefficients: float) -> float:
     """The most that coefficients gain of noise in the log of a channel, whose sum of squares is given; 0 of none.
 
@@ -143,11 +162,16 @@ def explained_before(state: State) -> float:
     """Sum of squares of the whitened residual that the adopted models explain together to first order.
 
     Delays, which are taken off to all orders, have no part in it."""
+    return explained_by(state, range(len(state.adopted)))
+
+
+def explained_by(state: State, places: Sequence[int]) -> float:
+    """The same of some of the adopted models."""
     residual = state.residual
     first_order = [
-        (terms.at(residual.samples), theta)
-        for model, theta in zip(state.adopted, state.theta, strict=True)
-        if (terms := model.terms(state.excitation)).delay is None
+        (terms.at(residual.samples), state.theta[place])
+        for place in places
+        if (terms := state.adopted[place].terms(state.excitation)).delay is None
     ]
     if not first_order:
         return 0.0

@@ -21,7 +21,7 @@ from magtensor.components import Component
 from magtensor.loop.assessment import Assessment, estimated
 from magtensor.loop.colour import beside_the_field
 from magtensor.loop.direction import attitude_series
-from magtensor.loop.factor import Factors, Groups, noise_alone, with_factor
+from magtensor.loop.factor import Factors, Groups, noise_alone, refitted, with_factor
 from magtensor.loop.gates import OF_THE_LAW, Candidate, explained_before, gained_of_a_log
 from magtensor.loop.likeness import effect_along, followed
 from magtensor.loop.log_noise import brought_in
@@ -361,11 +361,12 @@ def _predicted(inside: Array, outside: Array, basis: Array, groups: Groups) -> G
     sums = np.stack([inside[a:b].T @ inside[a:b] for a, b in itertools.pairwise(edges)])
     split = [_own_and_others(basis, group) for group in groups]
     total = sums.sum(axis=0)
+    noise = noise_alone(total / n, basis, groups)
+    whole = with_factor(total / n, basis, groups, noise)
     before, after = np.zeros(FOLDS), np.zeros(FOLDS)
     for k, (a, b) in enumerate(itertools.pairwise(edges)):
         train = (total - sums[k]) / (n - (b - a))
-        alone = noise_alone(train, basis, groups)
-        factors = with_factor(train, basis, groups, alone)
+        alone, factors = (refitted(train, basis, groups, near) for near in (noise, whole))
         for own, others in split:
             rest = float(np.sum((outside[a:b] @ own) ** 2))
             before[k] += rest + _error(alone.covariance, sums[k], own, others)

@@ -369,10 +369,10 @@ def _fit(
 
 
 def reweighed(record: Record, state: State, how: Fitting) -> State:
-    """The state with C and o fitted as `how` says, and its coefficients as they are."""
+    """The state with C and o fitted as `how` says, its coefficients and the samples that it believes as they are."""
     each = [a.terms(state.excitation) for a in state.adopted]
     raw, reference = without(record, each, state.theta)
-    fit = _fit(record, raw, reference, how, None)
+    fit = _fit(record, raw, reference, how, np.asarray(state.fit.keep))
     x = beside_the_site(excitation_of(record, fit, raw, state.lines), state.adopted, state.theta)
     return _state(record, state.adopted, state.theta, fit, raw, reference, how, x, state.estimate, state.lines)
 

@@ -92,7 +92,7 @@ def _adopted(found: Search, index: int) -> dict[str, Any]:
     names, sensors = state.terms.names[part], state.terms.sensors[part]
     units = state.terms.units[part]
     step = _step_of(found, model)
-    before, after = removal(state, index)
+    before, after = removal(found.told, index)
     if step is not None and step.adopted is not None and model.name == NAME:  # its waveform has seen the data
         before, after = (rms * step.before.residual.scale for rms in step.adopted.assessment.gain.rms)
     rivals = [] if step is None else list(step.rivals)
@@ -163,6 +163,8 @@ def why(candidate: Candidate, winner: Candidate | None) -> str:
         return f"noise in the log of a channel, which another model brought in, explains as much: {figures}"
     if candidate.of_second_order:
         return f"less than 0.3 % of what is adopted, whose next order would explain as much: {figures}"
+    if candidate.of_the_law:
+        return f"less than 5 % of an adopted effect of the same driver and sensors, whose law may miss it: {figures}"
     if not candidate.beyond_slow_noise:
         return f"slow noise as strong as the residual's own would explain as much: {figures}"
     if not candidate.passes:

@@ -28,6 +28,7 @@ from magtensor.loop.unexplained import unexplained
 from magtensor.loop.waveform import NAME
 
 MOSTLY = 0.5  # of what an effect adds: so much of it, predicted from the attitude, follows the attitude
+ALONG = 0.95  # cosine, with a source's vector or another event's; of one sensor 5 % of all directions are as near
 HARMONICS = 16  # of the turning, that a law of the attitude with a corner shows
 
 
@@ -36,13 +37,16 @@ def overshadowed(found: Search, fixed: int) -> tuple[list[int], str] | None:
     adopted, and why it is doubted."""
     state, left = found.last, staying(found)
     weakest: tuple[float, list[int], str] | None = None
+    if (part := _of_an_adopted_source(state, fixed)) is not None:
+        return part
     for places in _of_one_name(state, fixed):
         before, after = removal(state, *places)
         amount = float(np.sqrt(max(before**2 - after**2, 0.0)))
         if amount < left and (weakest is None or amount < weakest[0]) and (why := _of_the_attitude(state, places)):
             weakest = amount, places, why
-    if weakest is None or not unexplained(found, found.record)["present"]:
-        return _part_of_a_source(found, fixed)
+    present = bool(unexplained(found, found.record)["present"])
+    if weakest is None or not present:
+        return _part_of_a_source(found, fixed) or (_of_one_that_switches(state, fixed) if present else None)
     amount, places, why = weakest
     return places, f"it {why} and explains {amount:.3g} nT rms, less than the {left:.3g} nT that stay"
 
@@ -67,6 +71,51 @@ def _of_the_attitude(state: State, places: Sequence[int]) -> str:
     if frequency and frequency < HARMONICS * (turning := turning_Hz(state.excitation)):
         return f"may be a harmonic of the platform's turning ({turning:.3g} Hz)"
     return "follows the attitude" if attitude_share(state, places) > MOSTLY else ""
+
+
+def _of_an_adopted_source(state: State, fixed: int) -> tuple[list[int], str] | None:
+    """An offset that came or went and lies along the vectors of an adopted source that nobody logged."""
+    source = next((v for v in (_vector(state, i) for i, a in enumerate(state.adopted) if a.name == NAME)), None)
+    if source is None:
+        return None
+    for place, model in enumerate(state.adopted):
+        own = _vector(state, place) if place >= fixed and happens_once(model) else None
+        if own is not None and _along(own, source):
+            return [place], f"it lies along the vectors of {NAME}, of which it is a part"
+    return None
+
+
+def _of_one_that_switches(state: State, fixed: int) -> tuple[list[int], str] | None:
+    """Several offsets that came or went along one vector: something switches, and more often than they tell."""
+    events = [(i, _vector(state, i)) for i, a in enumerate(state.adopted) if i >= fixed and happens_once(a)]
+    known = [(i, v) for i, v in events if v is not None]
+    for _, first in known:
+        places = [i for i, v in known if _along(v, first) or _along(first, v)]
+        if len(places) > 1:
+            sensors = [s for s, v in zip(state.excitation.sensors, first.reshape(-1, 3), strict=True) if v.any()]
+            return (
+                places,
+                f"something in {', '.join(sensors)} switches along one vector, more often than such events tell",
+            )
+    return None
+
+
+def _vector(state: State, place: int) -> Array | None:
+    """(3 S,) nT for a unit of the one series of an adopted model, by which it moves each output; None where it has
+    several series."""
+    terms = state.adopted[place].terms(state.excitation)
+    if terms.series.shape[1] != 1 or terms.delay is not None:
+        return None
+    vector = np.zeros(3 * len(state.excitation.sensors))
+    raw = terms.part_output >= 0
+    np.add.at(vector, terms.part_output[raw], terms.part_weight[raw] * state.theta[place][terms.part_term[raw]])
+    return vector if vector.any() else None
+
+
+def _along(one: Array, other: Array) -> bool:
+    """Whether a vector lies along another one, in the outputs that it moves."""
+    seen = np.where(one != 0.0, other, 0.0)
+    return abs(float(one @ seen)) > ALONG * float(np.linalg.norm(one) * np.linalg.norm(seen))
 
 
 def _part_of_a_source(found: Search, fixed: int) -> tuple[list[int], str] | None:

@@ -13,6 +13,7 @@ from magtensor.loop.assessment import WHITE, Assessment, assess
 from magtensor.loop.contribution import happens_once
 from magtensor.loop.evidence import Whitened
 from magtensor.loop.gates import Candidate, explained_before
+from magtensor.loop.kin import explained_by_kin
 from magtensor.loop.log_noise import brought_in, channels_of
 from magtensor.loop.model import Adopted, State, generic
 from magtensor.loop.own_noise import OwnNoise
@@ -45,7 +46,7 @@ def candidates_of(state: State, models: Sequence[Component], failed: dict[str, s
     candidates = [
         Candidate(
             model, tried, terms, assessment, p, own_p, null_p, alpha, _log_noise(state, model, terms, assessment),
-            beside,
+            beside, explained_by_kin(state, model, terms, assessment),
         )
         for (model, tried, terms, assessment), p, own_p, null_p in zip(found, adjusted, own, null, strict=True)
     ]  # fmt: skip

@@ -14,7 +14,7 @@ from dataclasses import replace
 from magtensor.components import Component
 from magtensor.errors import DataError
 from magtensor.loop.adopting import on_those_that_show
-from magtensor.loop.contribution import without_models
+from magtensor.loop.contribution import eliminate, without_models
 from magtensor.loop.excitation import Excitation
 from magtensor.loop.found import Search, Step
 from magtensor.loop.gates import ALPHA
@@ -65,6 +65,8 @@ def search(
         ended = _without_those_that_wander(ended, rounds)
     record, state, how, steps = ended.record, ended.state, ended.how, ended.steps
     last = _settled(record, on_those_that_show(record, state, how, len(declared)), how)
+    if last.fit.keep.sum() < state.fit.keep.sum():  # what only these samples asked for goes with them
+        last, steps = _weighed_once_more(record, last, steps, how, len(declared))
     shared = ended.shared
     if shared is None or shared.objection == SINGLE_STRETCH:  # it may be flagged now
         shared = sought(last, record)
@@ -77,6 +79,7 @@ def search(
         if say is not None:
             say(f"taking {name} out again")
         record, state = renewed(record, without_models(record, found.last, places, how), how)
+        state, steps = _weighed_once_more(record, state, steps, how, len(declared))
         candidates = rounds.candidates(state := with_lines(state, record, lines), record, how)
         steps = (*steps, Step(state, tuple(candidates), None, refused={name: why}))
         last = _settled(record, state, how)
@@ -127,6 +130,17 @@ def _among(names: tuple[str, ...], ended: Ended, rounds: Rounds) -> Ended | None
     again = rounds.run(record, after.state, how)
     steps = tuple(replace(step, among=names) for step in found.steps)
     return replace(again, steps=(*ended.steps, *steps, *again.steps))
+
+
+def _weighed_once_more(
+    record: Record, state: State, steps: tuple[Step, ...], how: Fitting, fixed: int
+) -> tuple[State, tuple[Step, ...]]:
+    """A fit in which samples or models are missing that were there when the others were adopted, without those that no
+    longer earn their place; and the rounds, which say so."""
+    left, dropped = eliminate(record, state, how, fixed)
+    if not dropped:
+        return state, steps
+    return _settled(record, left, how), (*steps[:-1], replace(steps[-1], dropped=(*steps[-1].dropped, *dropped)))
 
 
 def _settled(record: Record, state: State, how: Fitting) -> State:

@@ -47,7 +47,7 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
     flagged = lasting(~state.fit.keep, beyond_the_reference(state, record))
     if flagged.any():  # while effects were sought, what lasts was believed
         seen = [c for c in seen if _still_significant(c, state)]
-    suspects = [c for c in seen if not (c.of_the_log or c.of_second_order)]
+    suspects = [c for c in seen if not (c.of_the_log or c.of_second_order or c.of_the_law)]
     words: list[str] = []
     if found.shared is not None and found.shared.significant:
         words.append(shared_words(found.shared, record.sensors))
