@@ -15,7 +15,7 @@ from magtensor.loop.model import Adopted, Fitting, Record, State, joint_state
 from magtensor.loop.own_noise import OwnNoise
 from magtensor.loop.residual import Residual, taken_off
 from magtensor.loop.settings import EventTimes, Frequencies, profiled
-from magtensor.loop.statistics import Gain, family_p, held_out_gain
+from magtensor.loop.statistics import Gain, concentrated, family_p, focused_gain, held_out_gain
 from magtensor.loop.terms import Terms
 from magtensor.loop.trial import WORST_RISE
 from magtensor.loop.waveform import NAME
@@ -140,11 +140,20 @@ def _of_an_event(state: State, place: int) -> float:
 def _rise(state: State, place: int) -> float:
     """The factor by which an adopted model raises the error on held-out blocks, over what it may.
 
-    What lasts has to lower it. Of what happened once the blocks where it did say little,
-    and what holds a waveform has its noise: both may raise it somewhat.
+    What lasts has to lower it. Of what happened once the blocks where it did say little, and what holds a waveform has
+    its noise: both may raise it somewhat. Of what lies in one fold, as a warming up that is soon over, the folds that
+    know equally much are asked, and where only a few blocks know anything it is as if it had happened once.
     """
-    before, after = removal(state, place)
-    return after / before / (1.0 - LEAST_FALL if _lasts(state.adopted[place]) else 1.0 + WORST_RISE)
+    assert state.terms is not None
+    others = np.ones(state.terms.count, dtype=bool)
+    others[slices(state)[place]] = False
+    blocks, freedom, lasting = _blocks(state, WHITE), state.residual.freedom, _lasts(state.adopted[place])
+    gain = held_out_gain(blocks, freedom, others)
+    if lasting and concentrated(blocks, others):
+        focused = focused_gain(blocks, freedom, others)
+        gain, lasting = focused or gain, focused is not None
+    before, after = gain.rms
+    return after / before / (1.0 - LEAST_FALL if lasting else 1.0 + WORST_RISE)
 
 
 def _lasts(model: Adopted) -> bool:

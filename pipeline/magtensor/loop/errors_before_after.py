@@ -27,17 +27,25 @@ def folds_for(state: State) -> NDArray[np.int_]:
 
     Folds of equal length. Where two neighbours hold nearly all that can be known of a model, they are divided into as
     many that know equally much: one part of a vehicle's passing is predicted by its other parts, and by nothing else.
+    So is one without which hardly anything is known, as the beginning of a warming up that is soon over.
     What is known follows from the regressors; their settings, as everywhere in these folds, were found on all samples.
     """
     n = len(state.excitation.time)
     edges = np.linspace(0, n, FOLDS + 1).round().astype(int)
     divided = set(edges.tolist())
     for model in state.adopted:
-        known = _known_until(model.terms(state.excitation))
+        terms = model.terms(state.excitation)
+        known = _known_until(terms)
         held = known[edges[2:]] - known[edges[:-2]]
+        left = _known_without_each(terms, edges)
         if held.max() > NEARLY_ALL:
-            inner = known[edges[held.argmax()]] + held.max() * np.arange(1, FOLDS) / FOLDS
-            divided.update(np.searchsorted(known, inner).tolist())
+            first, last = edges[held.argmax()], edges[held.argmax() + 2]
+        elif left.min() < 1.0 - NEARLY_ALL:
+            first, last = edges[left.argmin()], edges[left.argmin() + 1]
+        else:
+            continue
+        inner = known[first] + (known[last] - known[first]) * np.arange(1, FOLDS) / FOLDS
+        divided.update(np.searchsorted(known, inner).tolist())
     return np.array(sorted(divided))
 
 
@@ -46,6 +54,21 @@ def _known_until(terms: Terms) -> Array:
     square = (terms.series - terms.series.mean(axis=0)) ** 2
     share = square / np.maximum(square.sum(axis=0), 1e-300)
     return np.concatenate([[0.0], np.cumsum(share[:, terms.part_series].mean(axis=1))])
+
+
+def _known_without_each(terms: Terms, edges: NDArray[np.int_]) -> Array:
+    """(folds,) part of what is known of a model's coefficients that the other folds know, constants left out."""
+
+    def known(sums: Array, squares: Array, count: Array) -> Array:
+        return squares - sums**2 / np.maximum(count, 1)[:, None]
+
+    count = np.diff(edges)
+    sums = np.add.reduceat(terms.series, edges[:-1])
+    squares = np.add.reduceat((terms.series - terms.series.mean(axis=0)) ** 2, edges[:-1])
+    sums = sums - count[:, None] * terms.series.mean(axis=0)
+    every = np.maximum(squares.sum(axis=0), 1e-300)
+    others = known(sums.sum(axis=0) - sums, squares.sum(axis=0) - squares, count.sum() - count)
+    return np.asarray((others / every)[:, terms.part_series].mean(axis=1))
 
 
 def held_out_error(

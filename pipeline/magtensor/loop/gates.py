@@ -7,12 +7,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from magtensor.loop.assessment import BORNE_OUT, SLOWEST, Assessment
+from magtensor.loop.assessment import BORNE_OUT, Assessment
 from magtensor.loop.contribution import a_tone, happens_once
 from magtensor.loop.model import Adopted, State
 from magtensor.loop.residual import taken_off
 from magtensor.loop.settings import AnyChannel, profiled
-from magtensor.loop.terms import Terms, joined
+from magtensor.loop.terms import REFERENCE, Terms, joined
 
 ALPHA = 0.005  # family-wise probability that a clean survey gets an adoption, before the second gate
 SECOND_ORDER = 1e-5  # of the sum of squares that is explained: 0.3 % of an effect's size
@@ -84,8 +84,8 @@ class Candidate:
         """Whether noise does not explain it, all that was tried considered.
 
         By its p value alone. Or, because a dozen long blocks tell little of what is very unlikely, in noise of each
-        sensor's own spectrum, if the blocks bear it out: as a test of this model alone where its regressors are slow,
-        among all models where they turn with the field, for noise that turns with it (a mount that creeps) has no
+        sensor's own spectrum, if the blocks bear it out: as a test of this model alone where it is added to the axes,
+        among all models where it turns with the field, for noise that turns with it (a mount that creeps) has no
         spectrum. The p value of what happens once is not from blocks, and of a tone that spectrum does not know that
         its strongest line was taken.
         """
@@ -93,7 +93,7 @@ class Candidate:
             return True
         if happens_once(self.model) or a_tone(self.model):
             return False
-        by_blocks = self.assessment.p * self.tried if is_slow(self.terms) else self.adjusted_p
+        by_blocks = self.assessment.p * self.tried if adds_to_axes(self.terms) else self.adjusted_p
         return self.adjusted_own_p < self.alpha and by_blocks < BORNE_OUT
 
     @property
@@ -139,12 +139,14 @@ class Candidate:
         return self.predicts and self.beyond_slow_noise
 
 
-def is_slow(terms: Terms) -> bool:
-    """Whether most of the power of regressors, their means left out, is in the slowest twentieth of the frequencies."""
-    from scipy.fft import dct
-
-    power = dct(terms.series, axis=0, norm="ortho")[1:] ** 2
-    return bool(power[: len(power) // SLOWEST].sum() > 0.5 * power.sum())
+def adds_to_axes(terms: Terms) -> bool:
+    """Whether every series of regressors is added to all axes of a sensor alike, or to the reference: what turns with
+    the field is another one in each axis."""
+    if not np.all(terms.part_weight == 1.0):
+        return False
+    raw = terms.part_output != REFERENCE
+    touched = {(s, o) for s, o in zip(terms.part_series[raw].tolist(), terms.part_output[raw].tolist(), strict=True)}
+    return all((s, 3 * (o // 3) + axis) in touched for s, o in touched for axis in range(3))
 
 
 def gained_of_a_log(log_noise: float, coefficients: float) -> float:

@@ -73,7 +73,6 @@ class Rounds:
 
     def run(self, record: Record, state: State, how: Fitting) -> Ended:
         """Adopt the best, refit, repeat, until nothing is left that the data want."""
-        hidden = next((m for m in self.models if m.name == NAME), None)
         shared: Sought | None = None
         standing = trial(record, state, how)
         steps: list[Step] = []
@@ -100,26 +99,37 @@ class Rounds:
                 record, state = renewed(record, after.state, how)
                 standing = replace(after, state=state)
                 continue
-            shared = sought(state, record)
-            if shared is None or hidden is None or NAME in {a.name for a in state.adopted}:
+            shared, found = self.with_source(record, state, how, steps[-1])
+            if found is None:
                 break
-            shared, source = tried_source(hidden, record, state, shared, how, self.alpha)
-            instead = None
-            if source is None and shared.left_by:
-                instead = shared.left_by
-                source = _source_instead(hidden, record, state, shared, how, self.fixed, self.alpha)
-            if source is None:
-                break
-            if self.say is not None:
-                self.say(f"adopting {NAME}")
-            record, state, shared = source.record, source.after, None
-            last, dropped = eliminate(record, state, how, self.fixed)
-            if dropped and NAME not in dropped:  # what had taken a part of the source for its own
-                record, state = renewed(record, last, how)
-            gone = (*([instead] if instead else []), *(() if NAME in dropped else dropped))
-            steps[-1] = replace(steps[-1], adopted=source.evidence, dropped=gone)
-            standing = trial(record, state, how)
+            record, state, steps[-1] = found
+            shared, standing = None, trial(record, state, how)
         return Ended(record, state, how, tuple(steps), shared)
+
+    def with_source(
+        self, record: Record, state: State, how: Fitting, step: Step
+    ) -> tuple[Sought | None, tuple[Record, State, Step] | None]:
+        """The waveform that the sensors share, and the fit with a source nobody logged that makes it; None where none
+        is adopted."""
+        hidden = next((m for m in self.models if m.name == NAME), None)
+        shared = sought(state, record)
+        if shared is None or hidden is None or NAME in {a.name for a in state.adopted}:
+            return shared, None
+        shared, source = tried_source(hidden, record, state, shared, how, self.alpha)
+        instead = None
+        if source is None and shared.left_by:
+            instead = shared.left_by
+            source = _source_instead(hidden, record, state, shared, how, self.fixed, self.alpha)
+        if source is None:
+            return shared, None
+        if self.say is not None:
+            self.say(f"adopting {NAME}")
+        record, state = source.record, source.after
+        last, dropped = eliminate(record, state, how, self.fixed)
+        if dropped and NAME not in dropped:  # what had taken a part of the source for its own
+            record, state = renewed(record, last, how)
+        gone = (*([instead] if instead else []), *(() if NAME in dropped else dropped))
+        return None, (record, state, replace(step, adopted=source.evidence, dropped=gone))
 
 
 def _exchanged(

@@ -81,8 +81,11 @@ def search(
         record, state = renewed(record, without_models(record, found.last, places, how), how)
         state, steps = _weighed_once_more(record, state, steps, how, len(declared))
         candidates = rounds.candidates(state := with_lines(state, record, lines), record, how)
-        steps = (*steps, Step(state, tuple(candidates), None, refused={name: why}))
-        last = _settled(record, state, how)
+        step = Step(state, tuple(candidates), None, refused={name: why})
+        _, source = rounds.with_source(record, state, how, step)
+        if source is not None:  # which the model that is gone was a part of
+            record, state, step = source
+        steps, last = (*steps, step), _settled(record, state, how)
         not_tested = _not_tested(last.excitation, models)
         found = replace(
             found, last=last, steps=steps, not_tested=not_tested, record=record, shared=sought(last, record),

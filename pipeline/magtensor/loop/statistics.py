@@ -19,6 +19,7 @@ FOLDS = 10
 INTERLEAVED_FOLDS = 20
 LEAST_T = 2.0  # paired t of the held-out gain over folds
 LEAST_SHARE_OF_FOLDS = 0.8  # a strong slow effect gains unevenly, which keeps t low, but nearly everywhere
+CONCENTRATED = 0.9  # of what is known, in one fold: the others do not predict it
 LEAST_LEFT = 1e-3  # of the information in a direction, without any one block
 
 
@@ -320,6 +321,13 @@ def focused_folds(g: Grams, blocked: NDArray[np.bool_]) -> NDArray[np.int_]:
     known = np.cumsum(_share_of_blocks(g, ~blocked))
     edges = np.unique(np.searchsorted(known, np.linspace(0.0, 1.0, FOLDS + 1)[1:-1], side="left") + 1)
     return np.concatenate([[0], edges[edges < len(g.zz)], [len(g.zz)]])
+
+
+def concentrated(g: Grams, blocked: NDArray[np.bool_]) -> bool:
+    """Whether one contiguous fold of equal length holds nearly all that is known of the terms that are not blocked."""
+    share, count = _share_of_blocks(g, ~blocked), len(g.zz)
+    edges = np.linspace(0, count, min(FOLDS, count) + 1).round().astype(int)[:-1]
+    return bool(np.add.reduceat(share, edges).max() > CONCENTRATED)
 
 
 def _share_of_blocks(g: Grams, chosen: NDArray[np.bool_]) -> Array:
