@@ -1,0 +1,127 @@
+"""What is more of an adopted effect, one of many switchings, or a part of a source is no effect of its own."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+from loop_cases import Array, adopted_names, linear_state, scenario, synthetic, verdict_of
+
+from magtensor.loop.errors_before_after import folds_for
+from magtensor.loop.gates import OF_THE_LAW, Candidate, adds_to_axes
+from magtensor.loop.kin import drivers, explained_by_kin
+from magtensor.loop.model import Adopted, Fitting, Record, State, joint_state
+from magtensor.registry import Registry
+
+COURSE = np.sin(np.arange(1200) / 200.0)
+
+
+def model(name: str, **settings: Any) -> Adopted:
+    return Adopted(Registry.load().find("error_model", name), settings)
+
+
+def logged(record: Record) -> Record:
+    channels = {"temperature": COURSE, "current_pump": COURSE**2}
+    return replace(record, logged=channels, units={"temperature": "degC", "current_pump": "A"})
+
+
+def assessed(state: State, candidate: Adopted, sensor: str) -> tuple[Any, Any]:
+    """Terms, and an assessment in which all that is explained is on one sensor."""
+    terms = candidate.terms(state.excitation).at(state.residual.samples)
+    theta = np.array([1.0 if s == sensor else 0.0 for s in terms.sensors])
+    return terms, SimpleNamespace(estimate=SimpleNamespace(theta=theta, normal=np.eye(terms.count)))
+
+
+def test_what_drives_a_model() -> None:
+    x = linear_state(logged(synthetic(91))).excitation
+    warm = drivers(model("temperature_scale", channel="temperature"), x)
+    assert warm == drivers(model("temperature_alignment", channel="temperature"), x) == {"temperature"}
+    assert not warm & drivers(model("current_field", channel="current_pump"), x)
+    ageing = drivers(model("scale_drift", order=1, span_s=1199.0), x)
+    assert ageing & drivers(model("alignment_drift", tau_s=600.0, span_s=1199.0), x)
+    assert drivers(model("nonlinearity_quadratic"), x) == set()
+
+
+def test_kin_have_one_driver_and_one_sensor() -> None:
+    added = np.zeros((1200, 4, 3))
+    added[:, 1] = 20.0 * COURSE[:, None]
+    record = logged(synthetic(92, added=added))
+    offset = replace(model("temperature_offset", channel="temperature"), sensors=("S2",))
+    state = joint_state(record, [offset], Fitting())
+    scale = model("temperature_scale", channel="temperature")
+    current = model("current_field", channel="current_pump")
+    of_the_same = explained_by_kin(state, scale, *assessed(state, scale, "S2"))
+    # three of four parts of what is added lie off the field that all sensors see, and a little along it
+    assert of_the_same == pytest.approx(np.sum(added**2) * 0.75, rel=0.3)
+    assert explained_by_kin(state, scale, *assessed(state, scale, "S3")) == 0.0  # another sensor
+    assert explained_by_kin(state, current, *assessed(state, current, "S2")) == 0.0  # another driver
+    assert explained_by_kin(state, offset, *assessed(state, offset, "S2")) == 0.0  # more of the same has another lag
+
+
+@pytest.mark.parametrize(("gain", "refused"), [(0.9, True), (1.1, False)])
+def test_what_the_law_of_its_kin_may_miss_is_refused(gain: float, refused: bool) -> None:
+    kin = 4e5
+    of_gain, estimate = SimpleNamespace(total=gain * OF_THE_LAW * kin), SimpleNamespace(rank=12)
+    assessment: Any = SimpleNamespace(gain=of_gain, estimate=estimate)
+    terms: Any = None
+    found = Candidate(model("temperature_scale"), 1.0, terms, assessment, 0.0, 0.0, 0.0, kin=kin)
+    assert found.of_the_law is refused
+    assert not refused or not found.predicts
+
+
+def test_what_is_added_to_the_axes_and_what_turns_with_the_field() -> None:
+    x = linear_state(logged(synthetic(93))).excitation
+    added = [
+        model("temperature_offset", channel="temperature"),
+        model("offset_step", time_s=300.0),
+        model("reference_drift", order=1, span_s=1199.0),
+    ]
+    turned = [
+        model("temperature_scale", channel="temperature"),
+        model("turn_step", time_s=300.0),
+        model("nonlinearity_quadratic"),
+        model("hysteresis", half_width_nT=2000.0),
+    ]
+    assert all(adds_to_axes(m.terms(x)) for m in added)
+    assert not any(adds_to_axes(m.terms(x)) for m in turned)
+
+
+def telegraph(seed: int, time: Array, dwell_s: float) -> Array:
+    """(N,) 0 or 1, random switchings."""
+    rng = np.random.default_rng(seed)
+    at = np.cumsum(rng.exponential(dwell_s, 200))
+    return np.asarray(np.searchsorted(at, time) % 2, dtype=float)
+
+
+def test_a_sensor_that_switches_has_no_offsets_for_a_while(tmp_path: Path) -> None:
+    def change(path: Path) -> None:
+        with h5py.File(path, "r+") as file:
+            course = telegraph(5, np.asarray(file["time"][:] - file["time"][0]), 90.0)
+            file["b_raw"][:, 1] += course[:, None] * np.array([0.5, -0.7, -1.2])
+
+    told = verdict_of(tmp_path, scenario(94), change, models=["offset_while", "offset_step"])
+    assert told["adopted"] == []
+    assert told["unexplained"]["present"]
+    assert "switches along one vector" in told["unexplained"]["description"]
+
+
+@pytest.mark.parametrize("sensors", [None, ["S1"]])
+def test_a_warming_up_that_is_soon_over(tmp_path: Path, sensors: list[str] | None) -> None:
+    """A twentieth of the survey: nothing of it is known without the first fold."""
+    effect = {"type": "warm_up", "rms_nT": 0.45, "tau_s": 60.0, "sensors": sensors}
+    told = verdict_of(tmp_path, scenario(95, effect), models=["warm_up", "channel_response", "temperature_offset"])
+    assert adopted_names(told) == {"warm_up"}
+    assert told["adopted"][0]["settings"]["tau_s"] == pytest.approx(60.0, rel=0.05)
+    assert not told["unexplained"]["present"]
+
+
+def test_folds_for_what_is_soon_over() -> None:
+    record = synthetic(96)
+    long, short = (folds_for(joint_state(record, [model("warm_up", tau_s=tau)], Fitting())) for tau in (600.0, 60.0))
+    assert len(long) == 6
+    assert len(short) > 6 and short[1] < 60
