@@ -96,16 +96,23 @@ def search(
 
 def _without_those_that_wander(ended: Ended, rounds: Rounds) -> Ended:
     """The search gone on among the quiet sensors alone; what they show is then fitted on all sensors, each weighed by
-    all of its noise, and the search goes on there."""
+    all of its noise, and the search goes on there. Where they show nothing more, C and o are fitted with these weights
+    all the same: they would have a share of what is not theirs."""
     settled = _settled(ended.record, ended.state, ended.how)  # what is flagged is no wandering
+    wandering = False
     for names in quieter(settled):
+        wandering = True
         try:
             gone_on = _among(names, ended, rounds)
         except DataError:  # they do not determine a calibration by themselves
             continue
         if gone_on is not None:
             return gone_on
-    return ended
+    if not wandering:
+        return ended
+    how = replace(ended.how, noise=all_noise(settled))
+    again = joint_state(ended.record, ended.state.adopted, how, ended.state.theta, ended.state.lines)
+    return replace(ended, state=again, how=how)
 
 
 def _among(names: tuple[str, ...], ended: Ended, rounds: Rounds) -> Ended | None:
