@@ -8,6 +8,8 @@ from typing import Any
 import pytest
 from loop_cases import BASE, adopted_names, loaded, scenario, verdict_of
 
+from magtensor.loop import search
+from magtensor.loop.found import Search
 from magtensor.loop.model import Adopted, Fitting, joint_state
 from magtensor.loop.overshadowed import attitude_share
 from magtensor.registry import Registry
@@ -84,3 +86,17 @@ def test_what_switches_a_few_times_is_no_step_and_nothing_that_passed(
     assert adopted_names(told) == named
     assert told["unexplained"]["present"] == (not named)
     assert told["steps"][0]["adopted"] in ("offset_step", "passing_source")  # what it is about
+
+
+def test_a_source_that_is_taken_out_again_does_not_come_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever is taken out, a source is looked for once more; the search would not end if that found it again."""
+
+    def doubted(found: Search, fixed: int) -> tuple[list[int], str] | None:
+        return ([0], "it is doubted here") if found.last.adopted else None
+
+    monkeypatch.setattr(search, "overshadowed", doubted)
+    source = {"type": "latent_source", "waveform_of": {"type": "smooth", "rms": 2.0, "time_s": 60.0}, "rms_nT": 2.0}
+    told = verdict_of(tmp_path, scenario(69, source), models=["latent_source", "offset_drift"])
+    assert told["adopted"] == []
+    assert [s["adopted"] for s in told["steps"]] == ["latent_source", None, None]
+    assert told["steps"][-1]["refused"] == {"latent_source": "it is doubted here"}

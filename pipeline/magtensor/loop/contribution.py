@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from magtensor.calibration.types import Array
 from magtensor.loop.assessment import WHITE, Colours, block_count, estimated_in, explained
@@ -54,12 +55,17 @@ def _blocks(state: State, colours: Colours | None = None) -> Grams:
 def removal(state: State, *places: int) -> tuple[float, float]:
     """Held-out rms of the residual in nT, all noise alike, without and with some of the adopted models, the others in
     both."""
+    before, after = held_out_gain(_blocks(state, WHITE), state.residual.freedom, _all_but(state, places)).rms
+    return before * state.residual.scale, after * state.residual.scale
+
+
+def _all_but(state: State, places: Sequence[int]) -> NDArray[np.bool_]:
+    """(P,) the coefficients of the other models."""
     assert state.terms is not None
     others = np.ones(state.terms.count, dtype=bool)
     for place in places:
         others[slices(state)[place]] = False
-    before, after = held_out_gain(_blocks(state, WHITE), state.residual.freedom, others).rms
-    return before * state.residual.scale, after * state.residual.scale
+    return others
 
 
 def of_all_alike(state: State, place: int) -> bool:
@@ -144,10 +150,8 @@ def _rise(state: State, place: int) -> float:
     its noise: both may raise it somewhat. Of what lies in one fold, as a warming up that is soon over, the folds that
     know equally much are asked, and where only a few blocks know anything it is as if it had happened once.
     """
-    assert state.terms is not None
-    others = np.ones(state.terms.count, dtype=bool)
-    others[slices(state)[place]] = False
-    blocks, freedom, lasting = _blocks(state, WHITE), state.residual.freedom, _lasts(state.adopted[place])
+    others, lasting = _all_but(state, [place]), _lasts(state.adopted[place])
+    blocks, freedom = _blocks(state, WHITE), state.residual.freedom
     gain = held_out_gain(blocks, freedom, others)
     if lasting and concentrated(blocks, others):
         focused = focused_gain(blocks, freedom, others)

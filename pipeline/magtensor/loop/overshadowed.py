@@ -35,7 +35,7 @@ HARMONICS = 16  # of the turning, that a law of the attitude with a corner shows
 def overshadowed(found: Search, fixed: int) -> tuple[list[int], str] | None:
     """The weakest effect that follows the attitude and explains less than what stays, by its places among what is
     adopted, and why it is doubted."""
-    state, left = found.last, staying(found)
+    state, left = found.told, staying(found)
     weakest: tuple[float, list[int], str] | None = None
     if (part := _of_an_adopted_source(state, fixed)) is not None:
         return part
@@ -44,9 +44,10 @@ def overshadowed(found: Search, fixed: int) -> tuple[list[int], str] | None:
         amount = float(np.sqrt(max(before**2 - after**2, 0.0)))
         if amount < left and (weakest is None or amount < weakest[0]) and (why := _of_the_attitude(state, places)):
             weakest = amount, places, why
-    present = bool(unexplained(found, found.record)["present"])
+    several = _of_one_that_switches(state, fixed)
+    present = (weakest or several) is not None and bool(unexplained(found, found.record)["present"])
     if weakest is None or not present:
-        return _part_of_a_source(found, fixed) or (_of_one_that_switches(state, fixed) if present else None)
+        return _part_of_a_source(found, fixed) or (several if present else None)
     amount, places, why = weakest
     return places, f"it {why} and explains {amount:.3g} nT rms, less than the {left:.3g} nT that stay"
 

@@ -82,7 +82,7 @@ def search(
         state, steps = _weighed_once_more(record, state, steps, how, len(declared))
         candidates = rounds.candidates(state := with_lines(state, record, lines), record, how)
         step = Step(state, tuple(candidates), None, refused={name: why})
-        _, source = rounds.with_source(record, state, how, step)
+        source = None if name == NAME else rounds.with_source(record, state, how, step)[1]
         if source is not None:  # which the model that is gone was a part of
             record, state, step = source
         steps, last = (*steps, step), _settled(record, state, how)
