@@ -147,10 +147,13 @@ def test_the_loop_hears_the_battery_current_where_the_flight_determines_no_calib
     """docs/measured/quadcopter.md has the search over all models."""
     import json
 
-    survey = result("loop_quadcopter", "stages.close_loop.search=[current_field,temperature_offset,supply_offset]")
+    survey = result(
+        "loop_quadcopter", "stages.close_loop.search=[current_field,temperature_offset,supply_offset,scale_drift]"
+    )
     found = json.loads(str(survey.values("loop/verdict")))
     assert found["calibration"]["determined"] is False
-    current = next(a for a in found["adopted"] if a["error_model"] == "current_field")
+    (current,) = found["adopted"]  # a drift of the third order explains more, and is wrong on blocks held out
+    assert current["error_model"] == "current_field"
     assert "internal" in current["sensors"]
     size = {}
     for sensor in survey.sensors:

@@ -13,6 +13,7 @@ from magtensor.calibration.by_sensor import by_sensor
 from magtensor.calibration.joint import nearest_frame
 from magtensor.calibration.types import Array
 from magtensor.errors import DataError, NotEnoughData
+from magtensor.loop.log_noise import channels_of
 from magtensor.loop.model import Adopted, Fitting, Record, State, joint_state, without
 from magtensor.loop.terms import Terms
 from magtensor.sharing import shared_out
@@ -27,7 +28,8 @@ def folds_for(state: State) -> NDArray[np.int_]:
 
     Folds of equal length. Where two neighbours hold nearly all that can be known of a model, they are divided into as
     many that know equally much: one part of a vehicle's passing is predicted by its other parts, and by nothing else.
-    So is one without which hardly anything is known, as the beginning of a warming up that is soon over.
+    So is one without which hardly anything is known of a model that follows no channel, as the beginning of a warming
+    up that is soon over; a channel's course is seen elsewhere too, if less.
     What is known follows from the regressors; their settings, as everywhere in these folds, were found on all samples.
     """
     n = len(state.excitation.time)
@@ -40,7 +42,7 @@ def folds_for(state: State) -> NDArray[np.int_]:
         left = _known_without_each(terms, edges)
         if held.max() > NEARLY_ALL:
             first, last = edges[held.argmax()], edges[held.argmax() + 2]
-        elif left.min() < 1.0 - NEARLY_ALL:
+        elif left.min() < 1.0 - NEARLY_ALL and not channels_of(model, state.excitation):
             first, last = edges[left.argmin()], edges[left.argmin() + 1]
         else:
             continue
