@@ -26,6 +26,22 @@ class Columns:
         return out
 
 
+@dataclass(frozen=True)
+class Made:
+    """What sets of terms that differ in their series only make: (B, K, N) the series of each, and columns along the
+    field and across known directions, None where the residual has no such part."""
+
+    series: Array
+    along: Columns | None
+    sighted: Columns | None
+
+    @classmethod
+    def of(cls, residual: Residual, several: Sequence[Terms]) -> Made:
+        along = None if residual.along is None else along_the_field(residual, several)
+        sighted = None if residual.sighted is None else across_directions(residual, several)
+        return cls(_series_of_each(several), along, sighted)
+
+
 def along_the_field(residual: Residual, several: Sequence[Terms]) -> Columns:
     """The columns along the field of sets of terms that differ in their series only."""
     found = _columns(residual, several, residual.slow_modes.response, residual.shown_along)
@@ -39,7 +55,7 @@ def across_directions(residual: Residual, several: Sequence[Terms]) -> Columns:
     return _columns(residual, [t.at(rows) for t in several], residual.sighted.response, residual.shown_sighted)
 
 
-def series_of_each(several: Sequence[Terms]) -> Array:
+def _series_of_each(several: Sequence[Terms]) -> Array:
     """(B, K, N) the series of each set."""
     return np.stack([terms.series.T for terms in several])
 
@@ -54,7 +70,7 @@ def _columns(residual: Residual, several: Sequence[Terms], response: Array, show
     ----------
     response: (N, 3); shown: (3 S + 1, N).
     """
-    first, series = several[0], series_of_each(several)
+    first, series = several[0], _series_of_each(several)
     term, output, which = first.part_term, first.part_output, first.part_series
     wide = np.bincount(which[output != REFERENCE], minlength=series.shape[1]) > 3
     own = ~wide[which] | (output == REFERENCE)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from magtensor.calibration.types import Array
 from magtensor.loop.colour import Colour
-from magtensor.loop.columns import Columns, across_directions, along_the_field, series_of_each
+from magtensor.loop.columns import Columns, Made, across_directions, along_the_field
 from magtensor.loop.residual import Residual
 from magtensor.loop.terms import REFERENCE, Terms, joined
 from magtensor.loop.turned import TurnedColour
@@ -40,6 +40,20 @@ class Pieces:
     across: Array
     shown: Array
     alone: Array
+
+    @cached_property
+    def pairs(self) -> tuple[NDArray[np.int_], NDArray[np.int_]]:
+        """(K,), (K,) all ordered pairs of two different pieces of one term."""
+        same = self.term[:, None] == self.term
+        np.fill_diagonal(same, False)
+        first, second = np.nonzero(same)
+        return first, second
+
+    def into(self, count: int) -> Array:
+        """(P, R): 1 where a piece belongs to the term."""
+        out = np.zeros((count, len(self.term)))
+        out[self.term, np.arange(len(self.term))] = 1.0
+        return out
 
     @classmethod
     def of(cls, terms: Terms, residual: Residual) -> Pieces:
@@ -212,12 +226,14 @@ def grams_in(white: Whitened, terms: Terms | None, blocks: int = 1) -> Grams:
         return _products(known, new, edges), _products(new, new, edges)
 
     samples = np.diff(white.edges(blocks)).astype(float)
-    return _grams(white, [] if terms is None else [terms], sums, white.sums(blocks), samples)
+    several = [] if terms is None else [terms]
+    made = Made.of(white.residual, several) if several else None
+    return _grams(white, several, made, sums, white.sums(blocks), samples)
 
 
-def grams_of_each(white: Whitened, several: Sequence[Terms]) -> Grams:
+def grams_of_each(white: Whitened, several: Sequence[Terms], made: Made | None = None) -> Grams:
     """The same over all samples of each of several sets of terms, one in the place of each block; only in their series
-    do they differ."""
+    do they differ. What is made of them may be given: it is the same in noise of any colour."""
     count = len(several)
 
     def sums(known: Array, new: Array) -> tuple[Array, Array]:
@@ -226,12 +242,14 @@ def grams_of_each(white: Whitened, several: Sequence[Terms]) -> Grams:
 
     across, along, sighted = (None if s is None else s.repeat(count, axis=0) for s in white.sums(1))
     samples = np.full(count, float(len(white.residual.affine)))
-    return replace(_grams(white, several, sums, (across, along, sighted), samples), one_survey=True)
+    made = made or Made.of(white.residual, several)
+    return replace(_grams(white, several, made, sums, (across, along, sighted), samples), one_survey=True)
 
 
 def _grams(
     white: Whitened,
     several: Sequence[Terms],
+    made: Made | None,
     sums: _Sums,
     known: tuple[Array | None, Array | None, Array | None],
     samples: Array,
@@ -240,7 +258,7 @@ def _grams(
 
     Parameters
     ----------
-    several: the sets, or none; sums: of what is known and new, and of what is new.
+    several: the sets, or none, and what is made of them; sums: of what is known and new, and of what is new.
     known: products of what is known (B, ., .), across, along and sighted; samples: (B,).
     """
     residual, given, batch = white.residual, white.given, len(samples)
@@ -256,8 +274,8 @@ def _grams(
         zz, ze, ee = across[:, :own, :own], across[:, :own, m:], np.trace(across[:, m:, m:], axis1=1, axis2=2)
         zd[:, :, : m - own], dd[:, : m - own, : m - own] = across[:, :own, own:m], across[:, own:m, own:m]
         de[:, : m - own] = across[:, own:m, m:]
-        if several and _seen_across(several[0]):
-            series = series_of_each(several)
+        if made is not None and _seen_across(several[0]):
+            series = made.series
             new = slice(m - own, None)
             d = white.across.whiten(series.reshape(-1, series.shape[2]).T, back=white.over_time)
             seen, dd[:, new, new] = sums(white.known_across, d)
@@ -279,10 +297,10 @@ def _grams(
             aa[:, m:, m:] += mix.T @ new @ mix
 
     if along is not None and white.known_along is not None:
-        columns = along_the_field(residual, several) if several else None
+        columns = None if made is None else made.along
         add(along, white.known_along, columns, partial(white.along.whiten, back=white.over_time))
     if sighted is not None and white.known_sighted is not None:
-        add(sighted, white.known_sighted, across_directions(residual, several) if several else None, lambda c: c)
+        add(sighted, white.known_sighted, None if made is None else made.sighted, lambda c: c)
     return Grams(
         zz, zd, dd, ze, de, ee, aa, ar, rr, samples, Pieces.of(together, residual), p,
     )  # fmt: skip
@@ -301,7 +319,7 @@ def normal(g: Grams) -> tuple[Array, Array]:
         c = g.de - np.swapaxes(g.zd, 1, 2) @ solve[:, :, k:]
         s = pieces.series
         parts = t[:, s[:, None], s[None, :]] * pieces.shown
-        into = _incidence(g)
+        into = pieces.into(g.count)
         n += into @ parts @ into.T
         y += np.einsum("bro,ro->br", c[:, s], pieces.across) @ into.T
     if g.aa.any():
@@ -321,13 +339,6 @@ def _inverse(information: Array) -> Array:
     seen = values > _INNER_RANK * values[:, -1:]
     out: Array = (vectors * np.where(seen, 1.0 / np.where(seen, values, 1.0), 0.0)[:, None, :]) @ vectors.swapaxes(1, 2)
     return out
-
-
-def _incidence(g: Grams) -> Array:
-    """(P, R): 1 where a piece belongs to the term."""
-    into = np.zeros((g.count, len(g.pieces.term)))
-    into[g.pieces.term, np.arange(len(g.pieces.term))] = 1.0
-    return into
 
 
 def held_out(train: Grams, test: Grams, theta: Array, blocked: NDArray[np.bool_] | None = None) -> tuple[Array, Array]:

@@ -13,6 +13,7 @@ from magtensor.components import Component
 from magtensor.errors import UsageError
 from magtensor.loop.assessment import WHITE, colours_of, estimated, likeliest
 from magtensor.loop.beginnings import begun
+from magtensor.loop.columns import Made
 from magtensor.loop.excitation import Excitation
 from magtensor.loop.golden import REFINEMENTS, golden
 from magtensor.loop.model import Adopted, State, regressors
@@ -150,7 +151,8 @@ def best_settings(
     made = ((settings, few.terms(model, settings, failed)) for settings in grid)
     for batch in _batches((settings, terms) for settings, terms in made if terms is not None and terms.count):
         several = [terms for _, terms in batch]
-        both = zip(few.white.of_each(several), few.coloured.of_each(several), strict=True)
+        columns = Made.of(few.residual, several)
+        both = zip(few.white.of_each(several, columns), few.coloured.of_each(several, columns), strict=True)
         scores += [(white, coloured, settings) for (white, coloured), (settings, _) in zip(both, batch, strict=True)]
         for terms in several:
             series = projected(terms, few.freedom)

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from math import lgamma, log
 
 from magtensor.loop.assessment import Colours, estimated_in, explained
+from magtensor.loop.columns import Made
 from magtensor.loop.evidence import Whitened, grams_of_each
 from magtensor.loop.residual import Residual
 from magtensor.loop.statistics import explained_by_each
@@ -22,9 +23,9 @@ class Scorer:
     def __call__(self, terms: Terms) -> float:
         return self.of_each([terms])[0]
 
-    def of_each(self, several: Sequence[Terms]) -> list[float]:
-        """The same of several sets of terms that differ in their series only."""
-        found, ranks = explained_by_each(grams_of_each(self.white, several))
+    def of_each(self, several: Sequence[Terms], made: Made | None = None) -> list[float]:
+        """The same of several sets of terms that differ in their series only, and of what is made of them."""
+        found, ranks = explained_by_each(grams_of_each(self.white, several, made))
         most = several[0].count
         return [rarity(e - self.own, max(min(r, most), 1)) for e, r in zip(found, ranks, strict=True)]
 

@@ -99,8 +99,9 @@ def _looked_at(state: State, scored: Sequence[_Screened], failed: dict[str, str]
         fails: dict[str, str] = {}
         return refined(each.model, each.settings, state, fails), fails
 
+    starts = list({(each.model.name, str(each.settings)): each for each in scored}.values())
     distinct: dict[tuple[str, str], _Screened] = {}
-    for each, (settings, fails) in zip(scored, shared_out(moved, scored), strict=True):
+    for each, (settings, fails) in zip(starts, shared_out(moved, starts), strict=True):
         failed.update(fails)
         for one in (settings, *lower_orders(settings, profiled(each.model))):
             distinct.setdefault((each.model.name, str(one)), replace(each, settings=one))

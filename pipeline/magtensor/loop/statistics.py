@@ -70,6 +70,17 @@ def solve(n: Array, y: Array, scale: Array) -> Estimate:
     return Estimate(inverse @ y, inverse, n, basis.shape[1])
 
 
+def _theta_of_each(n: Array, y: Array, scale: Array) -> Array:
+    """(B, P) the coefficients that `solve` gives for each of the normal matrices (B, P, P) and right sides (B, P)."""
+    root = np.sqrt(np.maximum(scale, 1e-300))
+    values, vectors = symmetric_eigen(n / np.outer(root, root))
+    shown = (vectors.swapaxes(1, 2) @ (y / root)[:, :, None])[:, :, 0]
+    seen = values > IDENTIFIABLE
+    shown = np.where(seen, shown / np.where(seen, values, 1.0), 0.0)
+    out: Array = (vectors @ shown[:, :, None])[:, :, 0] / root
+    return out
+
+
 def identifiable(n: Array, scale: Array) -> Array:
     """(P, p) the directions that an information matrix (P, P) tells from nothing, `scale` as in `solve`."""
     return _directions(n, scale)[0]
@@ -108,22 +119,13 @@ def own_information_of_each(g: Grams) -> Array:
         # what moves all sensors alike is in the plane that they share, whatever each output shows alone
         together = np.zeros_like(out)
         np.add.at(together.T, pieces.term, (size * np.diagonal(pieces.shown)).T)
-        i, j = _pairs_within(pieces.term)
+        i, j = pieces.pairs
         if len(i):
             np.add.at(together.T, pieces.term[i], (of_pairs(i, j) * pieces.shown[i, j]).T)
         out = np.maximum(together, IDENTIFIABLE * out)
     if g.aa.any():
         out += np.diagonal(g.aa, axis1=1, axis2=2)[:, g.own :]
     return out
-
-
-def _pairs_within(terms: NDArray[np.int_]) -> tuple[NDArray[np.int_], NDArray[np.int_]]:
-    """(K,), (K,) all ordered pairs of two different pieces of one term."""
-    order = np.argsort(terms, kind="stable")
-    groups = np.split(order, np.flatnonzero(np.diff(terms[order])) + 1)
-    pairs = [(a, b) for group in groups if len(group) > 1 for a, b in itertools.permutations(group.tolist(), 2)]
-    found = np.array(pairs, dtype=np.int_).reshape(-1, 2)
-    return found[:, 0], found[:, 1]
 
 
 def explained_by_each(g: Grams) -> tuple[Array, NDArray[np.int_]]:
@@ -391,7 +393,7 @@ def gain_over(
     def loss(terms: NDArray[np.bool_]) -> Array:
         theta, use = np.zeros_like(y), np.flatnonzero(terms)
         if len(use):
-            theta[:, use] = [solve(a[np.ix_(use, use)], b[use], scale[use]).theta for a, b in zip(n, y, strict=True)]
+            theta[:, use] = _theta_of_each(n[:, use[:, None], use], y[:, use], scale[use])
         return held_out(train, test, theta)[1]
 
     return Gain(loss(before), loss(after), test.samples * freedom)
