@@ -4,7 +4,7 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: demo test lint papers bench clean
+.PHONY: demo test test-long lint papers bench clean
 
 $(STAMP): pyproject.toml
 	$(PYTHON) -m venv $(VENV)
@@ -24,6 +24,9 @@ lint: $(STAMP)
 
 test: lint
 	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n auto  # as many workers as cores, one thread each
+
+test-long: $(STAMP)
+	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n auto -m long  # whole searches beside those of the suite
 
 bench: $(STAMP)
 	$(BIN)/python benchmarks/pipeline.py

@@ -69,7 +69,10 @@ def _contrast_errors(array, raw: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate([b[0] - b[2], b[1] - b[3]]), jacobian @ array.covariance @ jacobian.T
 
 
-@pytest.mark.parametrize("align", [procrustes, pang2013, yin2014_linear])
+@pytest.mark.parametrize(
+    "align",
+    [procrustes, pytest.param(pang2013, marks=pytest.mark.long), pytest.param(yin2014_linear, marks=pytest.mark.long)],
+)
 def test_aligned_array(align) -> None:
     """Chi's parameters with their rotation angles, and contrasts between sensors, which need the whole covariance."""
     rng = np.random.default_rng(3)
@@ -93,7 +96,7 @@ def test_aligned_array(align) -> None:
     assert np.mean(contrasts) == pytest.approx(1.0, abs=0.12)
 
 
-@pytest.mark.parametrize("convention", [CHI, LI])
+@pytest.mark.parametrize("convention", [CHI, pytest.param(LI, marks=pytest.mark.long)])
 def test_li_array(convention) -> None:
     """All twelve parameters of each sensor against the truth in the mean sensor's own frame."""
     rng = np.random.default_rng(4)

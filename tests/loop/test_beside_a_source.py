@@ -30,6 +30,7 @@ def beside_a_magnet(*effects: dict[str, Any]) -> dict[str, Any]:
     return scenario(3, *effects, field=FIELD, motion=motion, logging={"attitude": True, "acceleration": True})
 
 
+@pytest.mark.long
 def test_a_sensor_that_is_not_where_it_should_be(tmp_path: Path) -> None:
     effect = {"type": "position_error", "offset_m": (1e-3 * np.array(OFFSETS_MM)).tolist()}
     told = verdict_of(tmp_path, beside_a_magnet(effect), models=MODELS)

@@ -62,7 +62,11 @@ def test_bad_samples_stay_and_spoil_no_others() -> None:
 
 @pytest.mark.parametrize(
     ("rate_Hz", "lags"),
-    [(20.0, (0.0, 0.005, 0.010, 0.015)), (10.0, (0.0, 0.02, 0.0, 0.0)), (10.0, (0.0, 0.0, 0.1, 0.0))],
+    [
+        pytest.param(20.0, (0.0, 0.005, 0.010, 0.015), marks=pytest.mark.long),
+        pytest.param(10.0, (0.0, 0.02, 0.0, 0.0), marks=pytest.mark.long),
+        (10.0, (0.0, 0.0, 0.1, 0.0)),
+    ],
     ids=["read one after the other", "a fifth of a sample", "a sample"],
 )
 def test_delays_of_sensors_are_found_to_all_orders(tmp_path: Path, rate_Hz: float, lags: tuple[float, ...]) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import pytest
 from loop_cases import BASE, adopted_names, scenario, verdict_of
 
 MODELS = ("site_gradient", "fixed_source", "nonlinearity_cubic")
@@ -24,6 +25,7 @@ def test_a_gradient_beside_a_nonlinearity_is_no_source_near_the_rig(tmp_path: Pa
     assert "not significant" in why  # beside the gradient
 
 
+@pytest.mark.long
 def test_a_source_near_the_rig_beside_a_nonlinearity_stays(tmp_path: Path) -> None:
     effects = (
         {"type": "fixed_source", "rms_nT": 1.0, "position_m": [2.0, 0.5, 0.3]},

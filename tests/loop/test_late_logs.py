@@ -23,7 +23,7 @@ def make_late(path: Path) -> None:
         logged[:] = np.concatenate([np.repeat(values[:1], LATE), values[:-LATE]])
 
 
-@pytest.mark.parametrize("rms_nT", [0.5, 5.0])
+@pytest.mark.parametrize("rms_nT", [0.5, pytest.param(5.0, marks=pytest.mark.long)])
 def test_it_is_found_with_its_delay(rms_nT: float, tmp_path: Path) -> None:
     effect = {"type": "current_field", "channel": "current_heater", "rms_nT": rms_nT}
     models = ["current_field", "channel_response", "offset_drift"]
@@ -46,7 +46,8 @@ def make_early(channel: str, samples: int) -> Callable[[Path], None]:
 
 
 @pytest.mark.parametrize(
-    ("name", "channel", "samples"), [("current_field", "current_heater", 6), ("channel_response", "wind", 40)]
+    ("name", "channel", "samples"),
+    [("current_field", "current_heater", 6), pytest.param("channel_response", "wind", 40, marks=pytest.mark.long)],
 )
 def test_a_delay_is_told_from_a_time_constant(name: str, channel: str, samples: int, tmp_path: Path) -> None:
     survey = scenario(33, {"type": name, "channel": channel, "rms_nT": 3.0})

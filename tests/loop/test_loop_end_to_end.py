@@ -61,7 +61,7 @@ def require_contract(found: Verdict) -> None:
     assert not {a["error_model"] for a in found["adopted"]} & {r["error_model"] for r in found["rejected"]}
 
 
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.long)])
 def test_a_clean_survey_gets_no_effect(tmp_path: Path, seed: int) -> None:
     found = verdict_of(tmp_path, scenario(seed))
     require_contract(found)
@@ -72,10 +72,10 @@ def test_a_clean_survey_gets_no_effect(tmp_path: Path, seed: int) -> None:
     assert found["error"]["held_out"]["after"]["total_field_rms_nT"]["all"] < 1.5 * NOISE_NT
 
 
-EFFECTS: list[tuple[str, dict[str, Any], bool]] = [
+EFFECTS: list[Any] = [
     ("current_field", {"rms_nT": 5.0, "channel": "current_heater"}, True),
-    ("nonlinearity_quadratic", {"rms_nT": 1.0}, False),
-    ("scale_drift", {"rms_nT": 1.0}, False),
+    pytest.param("nonlinearity_quadratic", {"rms_nT": 1.0}, False, marks=pytest.mark.long),
+    pytest.param("scale_drift", {"rms_nT": 1.0}, False, marks=pytest.mark.long),
     ("reference_scale", {"excess": 0.3}, False),
 ]  # temperature_offset and sampling_lag have tests of their own
 

@@ -159,6 +159,7 @@ def two_unlike(seed: int, *effects: dict[str, Any]) -> dict[str, Any]:
     return scenario(seed, *effects, instrument=instrument, channels={"temperature": temperature}, motion=motion)
 
 
+@pytest.mark.long
 def test_a_strong_slow_effect_of_the_worse_of_two_sensors(tmp_path: Path) -> None:
     """Thirteen times its noise; in noise of the residual's own colour next to nothing of it is left."""
     coefficients = [[0.0, 0.0, 0.0], [-40.0, -330.0, 430.0]]
@@ -176,7 +177,11 @@ def test_a_strong_slow_effect_of_the_worse_of_two_sensors(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize(
-    "noise", [{"flicker_nT_per_rtHz": 0.1}, {"flicker_nT_per_rtHz": 0.01, "flicker_exponent": 2.0}]
+    "noise",
+    [
+        {"flicker_nT_per_rtHz": 0.1},
+        pytest.param({"flicker_nT_per_rtHz": 0.01, "flicker_exponent": 2.0}, marks=pytest.mark.long),
+    ],
 )
 def test_strong_slow_noise_is_no_effect(tmp_path: Path, noise: dict[str, float]) -> None:
     instrument = scenario()["instrument"] | {"noise": {"white_sd_nT": 0.15} | noise, "seed": 101}

@@ -59,7 +59,7 @@ LINE = {"type": "temperature_offset", "lag_s": 100.0}
     ("effects", "order"),
     [
         ([LINE | {"rms_nT": 0.5}], 1),
-        ([BEND | {"rms_nT": 0.5}], 2),
+        pytest.param([BEND | {"rms_nT": 0.5}], 2, marks=pytest.mark.long),
         ([LINE | {"rms_nT": 0.4}, BEND | {"rms_nT": 0.4}], 2),
     ],
     ids=["line", "bend", "both"],
@@ -72,6 +72,7 @@ def test_the_order_of_a_temperature_is_the_lowest_that_does(
     assert (adopted.name, adopted.settings["order"]) == ("temperature_offset", order)
 
 
+@pytest.mark.long
 def test_two_ways_of_the_heat_are_two_lags_of_one_thermometer(tmp_path: Path) -> None:
     effects = [LINE | {"lag_s": lag, "rms_nT": 1.0} for lag in (10.0, 200.0)]
     models = ("temperature_offset", "channel_response", "temperature_rate", "offset_drift")
@@ -85,7 +86,7 @@ def test_two_ways_of_the_heat_are_two_lags_of_one_thermometer(tmp_path: Path) ->
 VISCOUS = ("viscous_magnetisation", "hysteresis", "eddy_current", "sampling_lag", "bandwidth")
 
 
-@pytest.mark.parametrize("taus", [(8.0,), (2.0, 60.0)], ids=["one", "two"])
+@pytest.mark.parametrize("taus", [(8.0,), pytest.param((2.0, 60.0), marks=pytest.mark.long)], ids=["one", "two"])
 def test_what_a_time_constant_leaves_is_another_one_and_no_other_effect(
     taus: tuple[float, ...], tmp_path: Path
 ) -> None:

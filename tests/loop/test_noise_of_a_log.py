@@ -46,12 +46,14 @@ PUMP = {"type": "current_field", "channel": "current_pump", "rms_nT": 2.0}
 SUPPLY = {"type": "supply_offset", "rms_nT": 2.0}
 
 
+@pytest.mark.long
 def test_a_voltage_that_knows_the_currents_better_than_their_logs_is_no_third_effect(tmp_path: Path) -> None:
     told = verdict_of(tmp_path, on_a_bus(MOTOR, PUMP, current_noise_A=0.02), models=OF_A_BUS)
     channels = [(a["error_model"], a["settings"]["channel"]) for a in told["adopted"]]
     assert sorted(channels) == [("current_field", "current_motor"), ("current_field", "current_pump")]
 
 
+@pytest.mark.long
 def test_an_effect_of_the_voltage_beside_that_of_a_noisy_current_is_found(tmp_path: Path) -> None:
     survey = on_a_bus(MOTOR, SUPPLY, current_noise_A=0.02)
     survey["channels"]["supply_voltage"]["wander_rms_V"] = 0.1  # else the pump's current is as good

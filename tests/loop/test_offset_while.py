@@ -21,7 +21,15 @@ def magnet(strength: float, sensors: int) -> list[dict[str, Any]]:
     ]
 
 
-@pytest.mark.parametrize(("sensors", "strength"), [(4, 0.3), (4, 300.0), (1, 1.5), (1, 3000.0)])
+@pytest.mark.parametrize(
+    ("sensors", "strength"),
+    [
+        (4, 0.3),
+        pytest.param(4, 300.0, marks=pytest.mark.long),
+        (1, 1.5),
+        pytest.param(1, 3000.0, marks=pytest.mark.long),
+    ],
+)
 def test_it_is_found_with_both_times(tmp_path: Path, sensors: int, strength: float) -> None:
     survey = scenario(11, *magnet(strength, sensors))
     if sensors == 1:

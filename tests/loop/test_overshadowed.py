@@ -48,6 +48,7 @@ def test_larger_effects_and_those_that_do_not_follow_the_attitude_are_kept_besid
     assert told["unexplained"]["present"] and told["unexplained"]["excess_rms_nT"] > 0.5
 
 
+@pytest.mark.long
 def test_what_happens_once_overshadows_nothing(tmp_path: Path) -> None:
     passing = {
         "type": "passing_source",
@@ -76,7 +77,9 @@ def test_how_much_of_an_effect_follows_the_attitude(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("seed", "named"), [(60, {"latent_source"}), (68, set())], ids=["a step of it", "like the temperature by chance"]
+    ("seed", "named"),
+    [(60, {"latent_source"}), pytest.param(68, set(), marks=pytest.mark.long)],
+    ids=["a step of it", "like the temperature by chance"],
 )
 def test_what_switches_a_few_times_is_no_step_and_nothing_that_passed(
     seed: int, named: set[str], tmp_path: Path

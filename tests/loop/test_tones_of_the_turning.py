@@ -39,6 +39,7 @@ def steady_with_a_dead_zone(path: Path) -> None:
         file["b_raw"][:] = clean + noise - size * np.tanh(clean / 6000.0)
 
 
+@pytest.mark.long
 def test_a_dead_zone_is_no_tone(tmp_path: Path) -> None:
     told = verdict_of(tmp_path, scenario(71), steady_with_a_dead_zone, ["nonlinearity_cubic", "periodic_interference"])
     assert "periodic_interference" in [s["adopted"] for s in told["steps"]]  # what this is about

@@ -125,6 +125,7 @@ def test_an_instrument_that_stands_still_is_refused_nine_parameters(name: str) -
         run(found, empty_survey(found))
 
 
+@pytest.mark.long
 def test_the_loop_names_the_temperature_of_the_ak09916() -> None:
     """On 1600 s of the flight, with one model to adopt or not; docs/measured/balloon.md has the whole."""
     import json

@@ -116,6 +116,7 @@ def test_windows_of_which_one_holds_filled_in_rows(folder: Path, tmp_path: Path)
     np.testing.assert_allclose(found["windows"]["matrix"], found["whole"]["matrix"], atol=2e-6)
 
 
+@pytest.mark.long
 def test_a_result_made_in_windows_is_made_again_in_windows(folder: Path) -> None:
     first = ("run", folder / "recipe.yaml", "--input", folder / "a.h5", "--output", folder / "first")
     assert "--memory 0.1 cannot be kept to" in magtensor(*first, "--memory", 0.1)

@@ -276,6 +276,7 @@ def test_standard_errors_and_intervals_are_true(known):
         assert np.std(shape) == pytest.approx(1, abs=0.3)
 
 
+@pytest.mark.long
 def test_many_rotations_near_the_limit_are_unbiased():
     """Plain maximum likelihood is off here by 1.5 standard errors in each direction: its mean square is 3.1."""
     rng = np.random.default_rng(12)

@@ -4,9 +4,9 @@ Any law of the attitude resembles any other one a little. Where something large 
 (a gradient of the site, and no attitude logged to know it by), a named law that is a small part of it is significant,
 predicts held-out blocks, and is wrong elsewhere: of the five components of a gradient one looks exactly like a
 quadratic nonlinearity. So an adopted effect that follows the attitude and explains less than what stays unexplained is
-taken out again. So is a tone that may be a harmonic of how the platform turns; and so is what happened once, where the
-sensors share a waveform that has no name and is larger, or switches along the same vectors: a step or a passage may be
-a part of it.
+taken out again. So is a tone that may be a harmonic of how the platform turns; and so is what happened once, where more
+of the kind beside it is significant and predicts nothing, as where a sensor wanders, or where the sensors share a
+waveform that has no name and is larger, or switches along the same vectors: a step or a passage may be a part of it.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from magtensor.loop.model import Adopted, State
 from magtensor.loop.residual import taken_off
 from magtensor.loop.settings import Frequencies, profiled
 from magtensor.loop.terms import joined
-from magtensor.loop.unexplained import unexplained
+from magtensor.loop.unexplained import unexplained, unlikely
 from magtensor.loop.waveform import NAME
 
 MOSTLY = 0.5  # of what an effect adds: so much of it, predicted from the attitude, follows the attitude
@@ -33,7 +33,7 @@ HARMONICS = 16  # of the turning, that a law of the attitude with a corner shows
 
 
 def overshadowed(found: Search, fixed: int) -> tuple[list[int], str] | None:
-    """The weakest effect that follows the attitude and explains less than what stays, by its places among what is
+    """The weakest effect that explains less than what stays and may be a part of it, by its places among what is
     adopted, and why it is doubted."""
     state, left = found.told, staying(found)
     weakest: tuple[float, list[int], str] | None = None
@@ -42,7 +42,9 @@ def overshadowed(found: Search, fixed: int) -> tuple[list[int], str] | None:
     for places in _of_one_name(state, fixed):
         before, after = removal(state, *places)
         amount = float(np.sqrt(max(before**2 - after**2, 0.0)))
-        if amount < left and (weakest is None or amount < weakest[0]) and (why := _of_the_attitude(state, places)):
+        if amount >= left or (weakest is not None and amount >= weakest[0]):
+            continue
+        if why := _of_the_attitude(state, places) or _of_what_wanders(found, state, places):
             weakest = amount, places, why
     several = _of_one_that_switches(state, fixed)
     present = (weakest or several) is not None and bool(unexplained(found, found.record)["present"])
@@ -72,6 +74,16 @@ def _of_the_attitude(state: State, places: Sequence[int]) -> str:
     if frequency and frequency < HARMONICS * (turning := turning_Hz(state.excitation)):
         return f"may be a harmonic of the platform's turning ({turning:.3g} Hz)"
     return "follows the attitude" if attitude_share(state, places) > MOSTLY else ""
+
+
+def _of_what_wanders(found: Search, state: State, places: Sequence[int]) -> str:
+    """Whether something that happened once may be a stretch of what wanders: more of the kind is significant beside it
+    and predicts nothing."""
+    last = found.steps[-1].candidates if found.steps else ()
+    if not happens_once(state.adopted[places[0]]):
+        return ""
+    more = [c.model.name for c in last if happens_once(c.model) and unlikely(c) and not c.passes]
+    return f"is no lone event ({' and '.join(more)} beside it would predict nothing)" if more else ""
 
 
 def _of_an_adopted_source(state: State, fixed: int) -> tuple[list[int], str] | None:

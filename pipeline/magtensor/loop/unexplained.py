@@ -41,9 +41,7 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
     state = found.told
     excess = excess_rms(state)
     last = found.steps[-1].candidates if found.steps else ()
-    seen = [
-        c for c in last if c.passes or (max(c.adjusted_p, c.adjusted_own_p) < c.alpha and c.adjusted_null_p < ALPHA)
-    ]
+    seen = [c for c in last if c.passes or unlikely(c)]
     flagged = lasting(~state.fit.keep, beyond_the_reference(state, record))
     if flagged.any():  # while effects were sought, what lasts was believed
         seen = [c for c in seen if _still_significant(c, state)]
@@ -95,6 +93,11 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
         "description": "; ".join([*(words if present else noise_words(state)), *beside]),
         "looks_like": untested + _looks_like(last) if present else [],
     }
+
+
+def unlikely(candidate: Candidate) -> bool:
+    """Whether no noise explains a model, whatever it predicts."""
+    return max(candidate.adjusted_p, candidate.adjusted_own_p) < candidate.alpha and candidate.adjusted_null_p < ALPHA
 
 
 def noise_words(state: State) -> list[str]:
