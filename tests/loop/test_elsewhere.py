@@ -204,6 +204,7 @@ def saturated(span: slice, limit_nT: float) -> Change:
     return change
 
 
+@pytest.mark.long
 def test_a_saturated_stretch_is_told_as_what_it_is(folder: Path) -> None:
     path = changed(folder, "clean.h5", saturated(slice(500, 580), 15_000.0))
     with h5py.File(path) as file, h5py.File(folder / "clean.h5") as clean:

@@ -175,7 +175,10 @@ def test_few_sensors(tmp_path: Path, array: dict[str, Any], rms_nT: float | None
     assert not found["unexplained"]["present"], found["unexplained"]
 
 
-@pytest.mark.parametrize("effect", [None, {"type": "temperature_offset", "rms_nT": 3.0, "lag_s": 100.0}])
+@pytest.mark.parametrize(
+    "effect",
+    [None, pytest.param({"type": "temperature_offset", "rms_nT": 3.0, "lag_s": 100.0}, marks=pytest.mark.long)],
+)
 def test_limited_tilt(tmp_path: Path, effect: dict[str, Any] | None) -> None:
     motion = {
         "type": "limited_tilt", "duration_s": 1800.0, "tilt_deg": 20.0, "tilt_time_s": 6.0,

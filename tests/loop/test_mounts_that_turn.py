@@ -24,7 +24,7 @@ MODELS = [
     [
         ("temperature_alignment", {"lag_s": 60.0}, ["S1", "S2", "S3", "S4"]),
         pytest.param("temperature_alignment", {"lag_s": 60.0}, ["S3"], marks=pytest.mark.long),
-        ("alignment_drift", {"tau_s": 600.0}, ["S2"]),
+        pytest.param("alignment_drift", {"tau_s": 600.0}, ["S2"], marks=pytest.mark.long),
         pytest.param("turn_step", {"time_s": 500.0}, ["S2"], marks=pytest.mark.long),
     ],
 )

@@ -27,7 +27,8 @@ def scaled(of_field: bool) -> Callable[[Path], None]:
     return change
 
 
-@pytest.mark.parametrize("of_field", [pytest.param(False, marks=pytest.mark.long), True])
+@pytest.mark.long
+@pytest.mark.parametrize("of_field", [False, True])
 def test_a_scale_factor_takes_the_offset_with_it_or_not(of_field: bool, tmp_path: Path) -> None:
     instrument = BASE["instrument"] | {"errors": BASE["instrument"]["errors"] | {"bias_nT": OFFSETS_NT}}
     channels = {"temperature": BASE["channels"]["temperature"] | {"log_noise": 0.0}}
