@@ -11,7 +11,7 @@ from joint_cases import Array, drawn, fitted, tensor_error, truth
 
 from magtensor.calibration.common_field import common_field
 from magtensor.calibration.joint import fit_joint
-from magtensor.calibration.maximum_likelihood import along, fit_scalar, scores
+from magtensor.calibration.maximum_likelihood import Scores, along, fit_scalar, minimised, scores
 from magtensor.errors import DataError, NotEnoughData
 
 PAIRS = ((1, 2), (0, 2), (0, 1))
@@ -228,3 +228,21 @@ def test_the_noise_does_not_lose_digits_beside_a_large_field() -> None:
     noise = 0.1 * rng.standard_normal((2000, 4, 3))
     small, large = (common_field(size * field + noise).noise for size in (100.0, 50_000.0))
     np.testing.assert_allclose(large, small, rtol=1e-5)
+
+
+def test_a_step_too_far_is_taken_back_without_a_word() -> None:
+    """Its lengths overflow, which is a RuntimeWarning anywhere else."""
+    rng = np.random.default_rng(7)
+    u = rng.standard_normal((3, 200))
+    y, total = u / np.linalg.norm(u, axis=0) * 300.0 + rng.standard_normal((3, 200)), np.full(200, 300.0)
+    asked = 0
+
+    def at(matrix: Array, offset: Array) -> Scores:
+        nonlocal asked
+        asked += 1
+        there = 1e200 * matrix if asked == 2 else matrix  # the first step
+        return scores(along(there, offset, y, total, 0.0), total)
+
+    found = minimised(np.diag([1.01, 0.99, 1.0]), np.array([2.0, -1.0, 0.0]), at)
+    assert found.chi2 == pytest.approx(1.0, abs=0.4)  # 191 degrees of freedom: four deviations
+    assert np.abs(found.matrix - np.eye(3)).max() < 0.01

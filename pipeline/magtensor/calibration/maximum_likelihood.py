@@ -289,7 +289,8 @@ def minimised(
         if damping:
             step, _ = scoring_step(here, damping)
         moved = stepped(matrix, offset, step)
-        there = at(*moved)
+        with np.errstate(over="ignore", divide="ignore", invalid="ignore"):  # a step too far is not taken
+            there = at(*moved)
         if np.isfinite(there.cost) and there.cost <= here.cost * (1 + 1e-12):
             (matrix, offset), here, damping = moved, there, damping / 10 if damping > 1e-9 else 0.0
             continue
