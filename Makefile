@@ -26,7 +26,7 @@ test: lint
 	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n auto  # as many workers as cores, one thread each
 
 test-long: $(STAMP)
-	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n auto -m long  # whole searches beside those of the suite
+	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n auto -m long  # those that `make test` leaves out
 
 bench: $(STAMP)
 	$(BIN)/python benchmarks/pipeline.py

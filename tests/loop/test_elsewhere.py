@@ -210,8 +210,7 @@ def test_a_saturated_stretch_is_told_as_what_it_is(folder: Path) -> None:
     with h5py.File(path) as file, h5py.File(folder / "clean.h5") as clean:
         away = np.abs(file["b_raw"][:, 1, 0] - clean["b_raw"][:, 1, 0])
     first, last = np.flatnonzero(away > 1000.0)[[0, -1]] / 2.0
-    events = ["offset_step", "offset_while", "scale_step", "passing_source", "nonlinearity_cubic"]
-    found = magtensor.close_loop(path, search=events)
+    found = magtensor.close_loop(path)
     left: dict[str, Any] = found.verdict["unexplained"]
     assert found.verdict["adopted"] == []
     assert left["present"]

@@ -73,12 +73,18 @@ def solve(n: Array, y: Array, scale: Array) -> Estimate:
 def _theta_of_each(n: Array, y: Array, scale: Array) -> Array:
     """(B, P) the coefficients that `solve` gives for each of the normal matrices (B, P, P) and right sides (B, P)."""
     root = np.sqrt(np.maximum(scale, 1e-300))
-    values, vectors = symmetric_eigen(n / np.outer(root, root))
-    shown = (vectors.swapaxes(1, 2) @ (y / root)[:, :, None])[:, :, 0]
-    seen = values > IDENTIFIABLE
-    shown = np.where(seen, shown / np.where(seen, values, 1.0), 0.0)
-    out: Array = (vectors @ shown[:, :, None])[:, :, 0] / root
+    values, vectors, shown = _directions_of_each(n, y, np.broadcast_to(root, y.shape))
+    out: Array = (vectors @ (shown / values)[:, :, None])[:, :, 0] / root
     return out
+
+
+def _directions_of_each(n: Array, y: Array, root: Array) -> tuple[Array, Array, Array]:
+    """Of each set the information (B, P) in its directions, these (B, P, P) and what the data say along them (B, P), in
+    coefficients times root (B, P); directions that are not identifiable have infinite information and say nothing."""
+    values, vectors = symmetric_eigen(n / (root[:, :, None] * root[:, None, :]))
+    seen = values > IDENTIFIABLE
+    shown = (vectors.swapaxes(1, 2) @ (y / root)[:, :, None])[:, :, 0]
+    return np.where(seen, values, np.inf), vectors, np.where(seen, shown, 0.0)
 
 
 def identifiable(n: Array, scale: Array) -> Array:
@@ -133,10 +139,8 @@ def explained_by_each(g: Grams) -> tuple[Array, NDArray[np.int_]]:
     many directions are identifiable."""
     n, y = normal(g)
     root = np.sqrt(np.maximum(own_information_of_each(g), 1e-300))
-    values, vectors = symmetric_eigen(n / (root[:, :, None] * root[:, None, :]))
-    seen = values > IDENTIFIABLE
-    shown = (vectors.swapaxes(1, 2) @ (y / root)[:, :, None])[:, :, 0]
-    return np.sum(np.where(seen, shown**2 / np.where(seen, values, 1.0), 0.0), axis=1), seen.sum(axis=1)
+    values, _, shown = _directions_of_each(n, y, root)
+    return np.sum(shown**2 / values, axis=1), np.isfinite(values).sum(axis=1)
 
 
 def family_p(g: Grams, sensors: Sequence[str], subset: Sequence[int] | None = None) -> float:
