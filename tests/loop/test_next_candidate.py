@@ -6,11 +6,13 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
-from loop_cases import BASE, adopted_names, scenario, verdict_of
+from loop_cases import BASE, adopted_names, linear_state, scenario, synthetic, verdict_of
 
 from magtensor.loop import rivals, rounds
 from magtensor.loop.model import Adopted, Fitting, Record, State
+from magtensor.loop.terms import Terms
 from magtensor.registry import Registry
 
 EFFECTS = ({"type": "temperature_offset", "rms_nT": 1.0}, {"type": "nonlinearity_cubic", "rms_nT": 0.6})
@@ -60,3 +62,40 @@ def test_a_slip_is_no_simpler_than_a_delay_that_predicts_more(other: Any, instea
 def test_what_lasts_stays() -> None:
     delay, drift = candidate("sampling_lag", 100.0), candidate("clock_drift", 200.0)
     assert rivals.lasting_instead(delay, [delay, drift]) is delay
+
+
+def test_a_small_part_of_what_failed_is_no_candidate() -> None:
+    """Every axis of one sensor follows a series of its own, and the output that is tested follows another one too: one
+    axis alone is a small part of what all explain, all but one are most of it, and the other series is beside it."""
+    rng = np.random.default_rng(4)
+    course = np.cumsum(rng.standard_normal((1200, 4)), axis=0)
+    course = (course - course.mean(axis=0)) / course.std(axis=0)
+    added = np.zeros((1200, 4, 3))
+    added[:, 0] = 3.0 * course[:, :3]
+    added[:, 1, 0] = 3.0 * course[:, 3]
+    state = linear_state(synthetic(8, added=added))
+    order = np.arange(4)
+    terms = Terms(("x",) * 4, ("S1",) * 3 + ("S2",), ("nT",) * 4, course, order, order, order).at(
+        state.residual.samples
+    )
+
+    def of(*which: int) -> Any:
+        return SimpleNamespace(terms=terms.only(which), assessment=SimpleNamespace(colours=state.colours))
+
+    failed = of(0, 1, 2)
+    assert rivals.part_of(of(0), failed, state)
+    assert not rivals.part_of(of(0, 1), failed, state)  # a rival that explains most of it
+    assert not rivals.part_of(of(3), failed, state)  # something else
+    assert not rivals.part_of(of(0, 3), failed, state)
+
+
+def test_it_is_told_why_a_part_was_not_tried(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first candidate is refused, and all others are said to be parts of it."""
+    monkeypatch.setattr(rounds, "_kept", lambda *_: (None, "refused"))
+    monkeypatch.setattr(rounds, "part_of", lambda *_: True)
+    survey = scenario(33, *EFFECTS, motion=BASE["motion"] | {"duration_s": 600.0})
+    told = verdict_of(tmp_path, survey, models=[str(e["type"]) for e in EFFECTS])
+
+    assert not adopted_names(told)
+    first, second = sorted(told["steps"][0]["refused"].items(), key=lambda named: named[1] != "refused")
+    assert first[1] == "refused" and second[1] == f"a small part of what {first[0]} explains, which failed"

@@ -21,6 +21,8 @@ from .types import Array, Mask
 LEAST_SAMPLES_PER_AXIS = 20  # below this the noise is taken as equal on all axes of the array
 LEAST_SHARE = 0.05  # of its sensor's mean noise variance: a smaller estimate is a Heywood case, not a quiet axis
 QUIETEST = 1e-4  # the same of a sensor among all: noise levels differ by factors of 30, and one of zero weighs all
+_CLEAR = 30.0  # times the noise variance in each direction of the plane: then it is the field's
+_ALIKE = 0.98  # cosine of the largest angle between two planes
 _CHUNK = 65536
 
 
@@ -93,7 +95,9 @@ def output_noise(raw: Array, keep: Mask | None = None, run: NDArray[np.int_] | N
     """White noise (S, 3) nT of every output, from what second differences in time have in common and have not.
 
     Second differences (over sqrt 6) of the outputs share a plane as the outputs do, and hold nothing slower than a
-    few samples: slow effects that no model knows yet cannot pass for noise. Needs at least two sensors.
+    few samples: slow effects that no model knows yet cannot pass for noise. Where the field hardly moves from one
+    sample to the next, those three directions would be noise of the worst sensor, and what is left too quiet: then it
+    is the plane of the outputs themselves that is projected off. Needs at least two sensors.
 
     Parameters
     ----------
@@ -111,7 +115,15 @@ def output_noise(raw: Array, keep: Mask | None = None, run: NDArray[np.int_] | N
         among = within if among is None else among & within
     if among is not None and among.sum() < LEAST_SAMPLES_PER_AXIS:
         among = None
-    return common_field(np.diff(raw, n=2, axis=0) / np.sqrt(6.0), keep=among).noise.reshape(raw.shape[1], 3)
+    second = np.diff(raw, n=2, axis=0) / np.sqrt(6.0)
+    found = common_field(second, keep=among)
+    moves = second if among is None else second[among]
+    if np.mean(found.coordinates(moves) ** 2, axis=0).min() < _CLEAR:
+        outputs = _plane(_factor(raw if keep is None else raw[keep])[1])[0]
+        own = np.linalg.qr(found.noise[:, None] * found.basis)[0]
+        if np.linalg.svd(own.T @ outputs)[1].min() < _ALIKE:
+            return _with_noise(_factor(moves)[1], len(moves), outputs)[0].reshape(raw.shape[1], 3)
+    return found.noise.reshape(raw.shape[1], 3)
 
 
 def _handed(basis: Array) -> Array:
@@ -150,28 +162,40 @@ def _plane(factor: Array) -> tuple[Array, Array]:
     return axes[:3].T, across.T @ across
 
 
-def _with_noise(factor: Array, count: int) -> tuple[Array, Array, Array]:
-    """Noise of each output, plane and perpendicular moments, by alternating between the two.
+def _off(factor: Array, plane: Array) -> tuple[Array, Array]:
+    """As `_plane`, the plane (n, 3) being known."""
+    basis = np.linalg.qr(plane)[0]
+    across = factor - (factor @ basis) @ basis.T
+    return basis, across.T @ across
+
+
+def _with_noise(factor: Array, count: int, known: Array | None = None) -> tuple[Array, Array, Array]:
+    """Noise of each output, plane and perpendicular moments, by alternating between the two, or that off a known plane
+    (3 S, 3) of the outputs in nT.
 
     Below `LEAST_SAMPLES_PER_AXIS` samples an axis, and with two sensors (whose axes share one residual), all
     outputs are given the same noise.
     """
     size = factor.shape[1]
     sd = np.ones(size)
-    basis, own = _plane(factor)
-    sd *= np.sqrt(max(np.trace(own), 1e-300) * count / (max(count - 4, 1) * (size - 3)))
+
+    def split() -> tuple[Array, Array]:
+        return _plane(factor / sd) if known is None else _off(factor / sd, known / sd[:, None])
+
+    basis, own = split()
+    sd = sd * np.sqrt(max(np.trace(own), 1e-300) * count / (max(count - 4, 1) * (size - 3)))
     if size <= 6 or count < LEAST_SAMPLES_PER_AXIS * size:
-        basis, own = _plane(factor / sd)
+        basis, own = split()
         return sd, basis, own
     for _ in range(200):
-        basis, own = _plane(factor / sd)
+        basis, own = split()
         share = 1.0 - np.sum(basis**2, axis=1)
         variance = np.diag(own) / np.maximum(share, 1e-6) * count / (count - 4)
         step = np.sqrt(np.clip(variance, 0.1, 10.0))
         before, sd = sd, np.maximum(sd * step, _least(sd))
         if np.max(np.abs(sd / before - 1)) < 1e-6:
             break
-    basis, own = _plane(factor / sd)
+    basis, own = split()
     return sd, basis, own
 
 

@@ -175,8 +175,8 @@ def _p_of(blocks: Grams, given: int, variance: float) -> float:
     from scipy.special import chdtrc
 
     n, y = normal(blocks.total())
-    scale = own_information(blocks)
-    every, without = solve(n[0], y[0], scale), solve(n[0, :given, :given], y[0, :given], scale[:given])
+    own = own_information(blocks)
+    every, without = solve(n[0], y[0], own), solve(n[0, :given, :given], y[0, :given], own.of(slice(given)))
     gained = max(explained(every) - explained(without), 0.0) / variance
     return float(chdtrc(max(every.rank - without.rank, 1), gained))
 

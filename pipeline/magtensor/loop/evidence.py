@@ -33,6 +33,7 @@ class Pieces:
         term, series: (R,) whose coefficient times which series.
         across: (R, 3 S) 1/nT, how it acts on the whitened outputs, what the sensors share projected off.
         shown: (R, R) products of that; alone: (R,) its square, were each output seen by itself.
+        noise: (P,) part of the variance of each term that is noise.
     """
 
     term: NDArray[np.int_]
@@ -40,6 +41,7 @@ class Pieces:
     across: Array
     shown: Array
     alone: Array
+    noise: Array
 
     @cached_property
     def pairs(self) -> tuple[NDArray[np.int_], NDArray[np.int_]]:
@@ -64,7 +66,7 @@ class Pieces:
         np.add.at(outputs, (which, on), terms.part_weight[raw] / residual.noise[on])
         across = outputs @ residual.projector
         alone = outputs**2 @ np.diagonal(residual.projector)
-        return cls(kinds // count, kinds % count, across, across @ across.T, alone)
+        return cls(kinds // count, kinds % count, across, across @ across.T, alone, terms.noise_of_each)
 
 
 @dataclass(frozen=True)

@@ -48,6 +48,8 @@ class Excitation(Acting):
         part_of: what this is a part of, and the numbers of the samples in it; None for a whole survey.
         courses: name of a thermometer -> its log, and its course without the noise of the log; filled as they are
             asked for, so that one is made for all fits of a record.
+        again: `output` and `field` with as much noise again as they hold; None where that is too little to make any
+            difference.
     """
 
     time: Array
@@ -68,6 +70,7 @@ class Excitation(Acting):
     station: Station | None = None
     part_of: tuple[Excitation, NDArray[np.int_]] | None = None
     courses: dict[str, tuple[Array, Array]] = dataclasses.field(default_factory=dict, compare=False, repr=False)
+    again: tuple[Array, Array] | None = dataclasses.field(default=None, compare=False, repr=False)
 
     def at(self, samples: NDArray[np.int_]) -> Excitation:
         """What an error model sees that looks at some of the samples only, each by itself. Logged channels are seen
@@ -85,9 +88,20 @@ class Excitation(Acting):
             waveform=None if self.waveform is None else self.waveform[samples],
             site=None if self.site is None else self.site[samples],
             part_of=(self, samples),
+            again=None,
         )
         vars(chosen)["matrix"] = self.matrix  # that of all samples
         return chosen
+
+    @cached_property
+    def noisier(self) -> Excitation | None:
+        """The same seen through as much noise again; None where that makes no difference."""
+        if self.again is None:
+            return None
+        output, field = self.again
+        seen = replace(self, output=output, field=field, again=None)
+        vars(seen)["matrix"] = self.matrix
+        return seen
 
     @property
     def duration(self) -> float:

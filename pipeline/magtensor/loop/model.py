@@ -32,6 +32,7 @@ _SLACK = 4.0  # in the error accepted while an effect may yet turn out to cause 
 SETTLED = 0.02  # of a standard deviation
 HARDLY_SHOWN = 1e3  # times the variance that a coefficient would have alone
 SHOWN = 3.0  # standard deviations
+_MATTERS = 1e-10  # of the square of the field: noise with less makes no regressor noisy
 _SHARES = (1.0, 0.5, 0.1)  # of a step, tried in this order
 _LIKELIHOOD_ROUNDING = 0.5  # a spectrum fitted anew is not the same to the last digit
 
@@ -90,18 +91,25 @@ class Record:
         )
 
     def excitation(
-        self, output: Array, field_: Array, lines: Sequence[float] = (), *, matrix: Array | None = None
+        self,
+        output: Array,
+        field_: Array,
+        lines: Sequence[float] = (),
+        *,
+        matrix: Array | None = None,
+        again: tuple[Array, Array] | None = None,
     ) -> Excitation:
         """What error models see, given the modelled outputs and fields (N, S, 3).
 
         Parameters
         ----------
         matrix: (S, 3, 3) C by which outputs follow from fields; None where the two have to tell.
+        again: as in `Excitation`.
         """
         x = Excitation(
             self.time, self.start, self.sensors, output, field_, self.quiet_field, self.logged, self.units, self.run,
             self.segment, self.position, self.attitude, tuple(lines), self.waveform, station=self.station,
-            courses=self.courses,
+            courses=self.courses, again=again,
         )  # fmt: skip
         if matrix is not None:
             vars(x)["matrix"] = matrix
@@ -120,7 +128,17 @@ def regressors(component: Component, x: Excitation, settings: Mapping[str, Any])
         raise UsageError(
             f"the error model {component.name} gives {type(terms).__name__}; magtensor.loop.terms.Terms would be right"
         )
-    return terms
+    return terms if x.noisier is None else replace(terms, noise=_noise_in(terms, component, x.noisier, settings))
+
+
+def _noise_in(terms: Terms, component: Component, noisier: Excitation, settings: Mapping[str, Any]) -> Array:
+    """(K,) part of the variance of each series that noise of the outputs makes: what as much noise again changes."""
+    again = component.function(noisier, **settings)
+    if again.series.shape != terms.series.shape:
+        return np.zeros(terms.series.shape[1])
+    made = np.mean((again.series - terms.series) ** 2, axis=0)
+    out: Array = np.minimum(made / np.maximum(terms.series.var(axis=0), 1e-300), 1.0)
+    return out
 
 
 @dataclass(frozen=True)
@@ -413,13 +431,23 @@ def excitation_of(record: Record, fit: JointFit, raw: Array, lines: Sequence[flo
     ----------
     raw: (N, S, 3) nT, that the fit was made from: a strong effect on one sensor would else be in the common field.
     """
-    q = nearest_frame(fit.forward)
     b = fit.scalar.field(fit.plane.coordinates(raw)) if fit.posterior is None else fit.posterior.field
-    if record.total_field is not None:
-        b = b * (record.total_field / np.linalg.norm(b, axis=1))[:, None]
-    output = by_sensor(fit.forward, b) + fit.offset
-    common = np.repeat((b @ q)[:, None], len(record.sensors), axis=1)
-    return record.excitation(output, common, lines, matrix=fit.forward @ q)
+    b = of_known_length(b, record.total_field)
+    q = nearest_frame(fit.forward)
+
+    def seen(b: Array) -> tuple[Array, Array]:
+        return by_sensor(fit.forward, b) + fit.offset, np.repeat((b @ q)[:, None], len(record.sensors), axis=1)
+
+    again, noise = None, fit.scalar.matrix  # of outputs divided by theirs
+    if fit.posterior is None and np.mean(noise**2) > _MATTERS * np.mean(b**2):
+        more = np.random.default_rng(0).normal(size=b.shape) @ noise.T
+        again = seen(of_known_length(b + more, record.total_field))
+    return record.excitation(*seen(b), lines, matrix=fit.forward @ q, again=again)
+
+
+def of_known_length(b: Array, total_field: Array | None) -> Array:
+    """Fields (N, 3) nT of the length (N,) nT that is known."""
+    return b if total_field is None else b * (total_field / np.linalg.norm(b, axis=1))[:, None]
 
 
 def beside_the_site(x: Excitation, adopted: Sequence[Adopted], theta: Sequence[Array]) -> Excitation:

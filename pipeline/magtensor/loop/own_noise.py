@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from magtensor.calibration.types import Array
 from magtensor.loop.columns import across_directions, along_the_field
 from magtensor.loop.residual import Residual
-from magtensor.loop.statistics import identifiable
+from magtensor.loop.statistics import Own, identifiable
 from magtensor.loop.terms import REFERENCE, Terms, joined
 
 LEAST = 64  # samples, of fewer the noise is taken for white
@@ -73,7 +73,7 @@ class OwnNoise:
         seen = np.zeros((len(tested), size))
         seen[:, tested] = np.eye(len(tested))
         seen[:, others] = -normal[np.ix_(tested, others)] @ _inverse(normal[np.ix_(others, others)])
-        seen = identifiable(seen @ normal @ seen.T, alone[tested]).T @ seen
+        seen = identifiable(seen @ normal @ seen.T, Own(alone[tested], terms.noise_of_each)).T @ seen
         rank = len(seen)
         if not rank:
             return 1.0

@@ -15,6 +15,7 @@ from magtensor.loop.settings import AnyChannel, profiled
 from magtensor.loop.several_logs import worse_log
 from magtensor.loop.terms import joined
 
+SMALL_PART = 0.5  # less than half is no rival: something else is the cause of most of it
 SLOW = 0.5  # of the survey: a longer lag is no better known than a drift
 
 
@@ -69,6 +70,14 @@ def containing(best: Candidate, possible: Sequence[Candidate], state: State) -> 
         if fold_gain(before, colours, other.terms, best.terms).total - alone.total < SEPARATION:
             return other
     return best
+
+
+def part_of(candidate: Candidate, other: Candidate, state: State) -> bool:
+    """Whether a candidate predicts a small part of what another one does, and next to nothing beside it."""
+    colours = other.assessment.colours
+    whole, own = (fold_gain(state, colours, c.terms).total for c in (other, candidate))
+    beside = fold_gain(state, colours, other.terms, candidate.terms).total - whole
+    return own < SMALL_PART * whole and beside < SMALL_PART * own
 
 
 def begun(candidate: Candidate) -> int:

@@ -20,7 +20,7 @@ from magtensor.loop.model import Fitting, Record, State, generic
 from magtensor.loop.needs import missing
 from magtensor.loop.own_fit import at_their_own_fit
 from magtensor.loop.profiling import already, repeatable
-from magtensor.loop.rivals import containing, hardly_begun, simplest
+from magtensor.loop.rivals import containing, hardly_begun, part_of, simplest
 from magtensor.loop.screening import candidates_of
 from magtensor.loop.spectrum import spectral_lines
 from magtensor.loop.trial import Trial, on_the_folds_of, per_sample, trial
@@ -210,6 +210,9 @@ def _first_kept(
         after, why = _kept(record, before, chosen, how)
         if after is None:
             refused[chosen.model.name] = why
+            for c in candidates:
+                if c.passes and c.model.name not in refused and part_of(c, chosen, before.state):
+                    refused[c.model.name] = f"a small part of what {chosen.model.name} explains, which failed"
             continue
         last, dropped = eliminate(record, after.state, how, fixed)
         if dropped:

@@ -13,6 +13,7 @@ from magtensor.calibration.types import Array
 from magtensor.loop.evidence import Grams, held_out, normal
 
 IDENTIFIABLE = 1e-6  # of a regressor's own information: a direction with less left is not estimated
+MOSTLY_NOISE = 2.0  # times the noise in regressors: less is left in a direction of which they show noise above all
 BLOCK_COUNTS = (120, 30, 12)  # long blocks protect against correlation longer than a short block
 LEAST_BLOCKS = 6
 FOLDS = 10
@@ -57,53 +58,80 @@ def symmetric_eigen(m: Array) -> tuple[Array, Array]:
     return values, vectors
 
 
-def solve(n: Array, y: Array, scale: Array) -> Estimate:
+@dataclass(frozen=True)
+class Own:
+    """What regressors tell by themselves.
+
+    Attributes:
+        information: (P,) of each before the fit's own freedom was projected off.
+        noise: (P,) part of it that is noise: what noise of the outputs makes of a rate of change, above all.
+    """
+
+    information: Array
+    noise: Array
+
+    def of(self, which: NDArray[np.int_] | slice) -> Own:
+        """Those of some regressors."""
+        return Own(self.information[which], self.noise[which])
+
+    @property
+    def root(self) -> Array:
+        """(P,) a unit of which each is measured in."""
+        out: Array = np.sqrt(np.maximum(self.information, 1e-300))
+        return out
+
+    def shown(self, values: Array, vectors: Array) -> NDArray[np.bool_]:
+        """(..., P) whether regressors, in their units, show a direction, of which information (..., P) is left: more
+        than rounding, and than the noise in them."""
+        noise = MOSTLY_NOISE * (self.noise @ vectors**2) if self.noise.any() else 0.0
+        return values > np.maximum(IDENTIFIABLE, noise)
+
+
+def solve(n: Array, y: Array, own: Own) -> Estimate:
     """Least squares in the identifiable directions of one normal matrix.
 
     Parameters
     ----------
     n: (P, P), y: (P,).
-    scale: (P,) information of each regressor before the fit's own freedom was projected off.
+    own: of each regressor.
     """
-    basis, values = _directions(n, scale)
+    basis, values = _directions(n, own)
     inverse = basis / values @ basis.T
     return Estimate(inverse @ y, inverse, n, basis.shape[1])
 
 
-def _theta_of_each(n: Array, y: Array, scale: Array) -> Array:
+def _theta_of_each(n: Array, y: Array, own: Own) -> Array:
     """(B, P) the coefficients that `solve` gives for each of the normal matrices (B, P, P) and right sides (B, P)."""
-    root = np.sqrt(np.maximum(scale, 1e-300))
-    values, vectors, shown = _directions_of_each(n, y, np.broadcast_to(root, y.shape))
-    out: Array = (vectors @ (shown / values)[:, :, None])[:, :, 0] / root
+    values, vectors, shown = _directions_of_each(n, y, own, np.broadcast_to(own.root, y.shape))
+    out: Array = (vectors @ (shown / values)[:, :, None])[:, :, 0] / own.root
     return out
 
 
-def _directions_of_each(n: Array, y: Array, root: Array) -> tuple[Array, Array, Array]:
+def _directions_of_each(n: Array, y: Array, own: Own, root: Array) -> tuple[Array, Array, Array]:
     """Of each set the information (B, P) in its directions, these (B, P, P) and what the data say along them (B, P), in
     coefficients times root (B, P); directions that are not identifiable have infinite information and say nothing."""
     values, vectors = symmetric_eigen(n / (root[:, :, None] * root[:, None, :]))
-    seen = values > IDENTIFIABLE
+    seen = own.shown(values, vectors)
     shown = (vectors.swapaxes(1, 2) @ (y / root)[:, :, None])[:, :, 0]
     return np.where(seen, values, np.inf), vectors, np.where(seen, shown, 0.0)
 
 
-def identifiable(n: Array, scale: Array) -> Array:
-    """(P, p) the directions that an information matrix (P, P) tells from nothing, `scale` as in `solve`."""
-    return _directions(n, scale)[0]
+def identifiable(n: Array, own: Own) -> Array:
+    """(P, p) the directions that an information matrix (P, P) tells from nothing, `own` as in `solve`."""
+    return _directions(n, own)[0]
 
 
-def _directions(n: Array, scale: Array) -> tuple[Array, Array]:
+def _directions(n: Array, own: Own) -> tuple[Array, Array]:
     """Identifiable directions (P, p) and their information (p,), in scaled coordinates undone again."""
-    root = np.sqrt(np.maximum(scale, 1e-300))
+    root = own.root
     values, vectors = symmetric_eigen(n / np.outer(root, root))
-    seen = values > IDENTIFIABLE
+    seen = own.shown(values, vectors)
     return vectors[:, seen] / root[:, None], values[seen]
 
 
-def own_information(g: Grams) -> Array:
-    """(P,) the information each regressor would have if the fit had no freedom of its own, constants left out."""
-    out: Array = own_information_of_each(g.total())[0]
-    return out
+def own_information(g: Grams) -> Own:
+    """What each regressor would tell if the fit had no freedom of its own, constants left out."""
+    return Own(own_information_of_each(g.total())[0], g.pieces.noise)
 
 
 def own_information_of_each(g: Grams) -> Array:
@@ -139,7 +167,7 @@ def explained_by_each(g: Grams) -> tuple[Array, NDArray[np.int_]]:
     many directions are identifiable."""
     n, y = normal(g)
     root = np.sqrt(np.maximum(own_information_of_each(g), 1e-300))
-    values, _, shown = _directions_of_each(n, y, root)
+    values, _, shown = _directions_of_each(n, y, Own(root[0] ** 2, g.pieces.noise), root)
     return np.sum(shown**2 / values, axis=1), np.isfinite(values).sum(axis=1)
 
 
@@ -188,15 +216,15 @@ def wald_p(g: Grams, chosen: Sequence[int], alone: Sequence[int] = (), most: int
 
     count = len(g.zz)
     subset = np.asarray(chosen, dtype=int)
-    scale = own_information(g)
+    own = own_information(g)
     others = np.setdiff1d(np.arange(g.count), [*chosen, *alone])
-    full_n, full_y = _without_others(*normal(g.total()), subset, others, scale)
-    basis, values = _directions(full_n[0], scale[subset])
+    full_n, full_y = _without_others(*normal(g.total()), subset, others, own)
+    basis, values = _directions(full_n[0], own.of(subset))
     basis = basis[:, np.argsort(values)[::-1][:most]]
     p = basis.shape[1]
     if p == 0 or p >= count:
         return 1.0
-    n, y = _without_others(*normal(g.without_each()), subset, others, scale)
+    n, y = _without_others(*normal(g.without_each()), subset, others, own)
     basis = _confirmed(basis @ np.linalg.inv(np.linalg.cholesky(basis.T @ full_n[0] @ basis)).T, n)
     p = basis.shape[1]
     if p == 0:
@@ -230,17 +258,17 @@ def _confirmed(basis: Array, n: Array) -> Array:
 
 
 def _without_others(
-    n: Array, y: Array, chosen: NDArray[np.int_], others: NDArray[np.int_], scale: Array
+    n: Array, y: Array, chosen: NDArray[np.int_], others: NDArray[np.int_], own: Own
 ) -> tuple[Array, Array]:
     """The chosen coefficients' part of a batch of normal equations, the others projected off."""
     if not len(others):
         return n[:, chosen[:, None], chosen], y[:, chosen]
-    root = np.sqrt(np.maximum(scale, 1e-300))
+    root = own.root
     n, y = n / np.outer(root, root), y / root
-    own = np.linalg.pinv(n[:, others[:, None], others], rcond=1e-8, hermitian=True)
+    inverse = np.linalg.pinv(n[:, others[:, None], others], rcond=1e-8, hermitian=True)
     mixed = n[:, chosen[:, None], others]
-    n2 = n[:, chosen[:, None], chosen] - mixed @ own @ np.swapaxes(mixed, 1, 2)
-    y2 = y[:, chosen] - (mixed @ own @ y[:, others, None])[:, :, 0]
+    n2 = n[:, chosen[:, None], chosen] - mixed @ inverse @ np.swapaxes(mixed, 1, 2)
+    y2 = y[:, chosen] - (mixed @ inverse @ y[:, others, None])[:, :, 0]
     return n2 * np.outer(root[chosen], root[chosen]), y2 * root[chosen]
 
 
@@ -392,12 +420,12 @@ def gain_over(
     """
     train, test = g.chosen(train_masks), g.chosen(test_masks)
     n, y = normal(train)
-    scale = own_information(g)
+    own = own_information(g)
 
     def loss(terms: NDArray[np.bool_]) -> Array:
         theta, use = np.zeros_like(y), np.flatnonzero(terms)
         if len(use):
-            theta[:, use] = _theta_of_each(n[:, use[:, None], use], y[:, use], scale[use])
+            theta[:, use] = _theta_of_each(n[:, use[:, None], use], y[:, use], own.of(use))
         return held_out(train, test, theta)[1]
 
     return Gain(loss(before), loss(after), test.samples * freedom)

@@ -26,6 +26,8 @@ class Terms:
             an output, numbered 3 * sensor + axis, or REFERENCE; all weights are 1 where none are given.
         delay: (N, K) s by which a unit of the coefficient makes outputs late, of which the series is what that adds to
             first order, of weight 1; None where series are added as they are.
+        noise: (K,) part of the variance of each series that is noise of the outputs, seen in the field; 0 where not
+            given.
     """
 
     names: tuple[str, ...]
@@ -37,10 +39,13 @@ class Terms:
     part_series: NDArray[np.int_]
     delay: Array | None = None
     part_weight: Array = field(default_factory=lambda: np.zeros(0))
+    noise: Array = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:
         if not len(self.part_weight):
             object.__setattr__(self, "part_weight", np.ones(len(self.part_term)))
+        if len(self.noise) != self.series.shape[1]:
+            object.__setattr__(self, "noise", np.zeros(self.series.shape[1]))
 
     @property
     def count(self) -> int:
@@ -96,7 +101,17 @@ class Terms:
             self.part_series[parts],
             self.delay,
             self.part_weight[parts],
+            self.noise,
         )
+
+    @property
+    def noise_of_each(self) -> Array:
+        """(P,) part of the variance of each term that is noise: of its series, on average."""
+        weight = self.part_weight**2
+        total = np.bincount(self.part_term, weight, minlength=self.count)
+        share = np.bincount(self.part_term, weight * self.noise[self.part_series], minlength=self.count)
+        out: Array = share / np.maximum(total, 1e-300)
+        return out
 
     @property
     def unweighted(self) -> Terms:
@@ -104,7 +119,10 @@ class Terms:
         order = np.arange(len(self.part_term))
         series = self.series[:, self.part_series] * self.part_weight
         delay = None if self.delay is None else self.delay[:, self.part_series]
-        return replace(self, series=series, part_series=order, delay=delay, part_weight=np.ones(len(order)))
+        return replace(
+            self, series=series, part_series=order, delay=delay, part_weight=np.ones(len(order)),
+            noise=self.noise[self.part_series],
+        )  # fmt: skip
 
 
 def stacked(parts: Sequence[Terms]) -> Terms:
@@ -149,4 +167,5 @@ def joined(parts: list[Terms]) -> Terms:
         np.concatenate([p.part_output for p in parts]),
         np.concatenate([p.part_series + series[i] for i, p in enumerate(parts)]),
         part_weight=np.concatenate([p.part_weight for p in parts]),
+        noise=np.concatenate([p.noise for p in parts]),
     )
