@@ -195,7 +195,7 @@ def summary(verdict: dict[str, Any]) -> str:
     for one in verdict["adopted"]:
         evidence = one["evidence"]
         settings = ", ".join(f"{k} {_short(v)}" for k, v in one["settings"].items() if not isinstance(v, list))
-        rivals = one["indistinguishable_from"]
+        rivals, others = one["indistinguishable_from"], one.get("channels_as_good", [])
         before, after = evidence["held_out_rms_before_nT"], evidence["held_out_rms_after_nT"]
         words = [
             *([settings] if settings else []),
@@ -203,6 +203,7 @@ def summary(verdict: dict[str, Any]) -> str:
             f"held-out residual {figure(before)} -> {figure(after)} nT",
             *([f"z {evidence['z']:.3g}"] if evidence["z"] is not None else []),
             *([f"not told from {', '.join(rivals)}"] if rivals else []),
+            *([f"following {' or '.join(others)} it would do as well"] if others else []),
         ]
         lines.append(f"  adopted {one['error_model']}: {'; '.join(words)}")
     if verdict["rejected"]:

@@ -21,6 +21,7 @@ class Step:
         dropped: models dropped after the refit.
         refused: model -> why it was not kept after it had been fitted.
         among: the sensors looked at, where some that wander were left out; () where all were.
+        channels: others that the data do not separate from the one that it follows.
     """
 
     before: State
@@ -30,6 +31,7 @@ class Step:
     dropped: tuple[str, ...] = ()
     refused: Mapping[str, str] = field(default_factory=dict)
     among: tuple[str, ...] = ()
+    channels: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -108,6 +108,7 @@ def _adopted(found: Search, index: int) -> dict[str, Any]:
         ],
         "evidence": {"held_out_rms_before_nT": before, "held_out_rms_after_nT": after, "z": z_of(p)},
         "indistinguishable_from": rivals,
+        **({"channels_as_good": list(step.channels)} if step is not None and step.channels else {}),
     }
 
 
@@ -139,7 +140,7 @@ def _rejected(found: Search) -> list[dict[str, Any]]:
                 last[candidate.model.name] = f"round {number}: {why(candidate, step.adopted)}"
         for name, reason in step.refused.items():
             last[name] = f"round {number}: {reason}"
-        for name in step.dropped:
+        for name in set(step.dropped) - set(step.refused):
             last[name] = f"round {number}: dropped, no longer significant beside the others"
     if found.shared is not None and found.shared.significant:
         last[NAME] = found.shared.objection or "not among the models that may be adopted"

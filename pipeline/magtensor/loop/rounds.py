@@ -24,6 +24,7 @@ from magtensor.loop.rivals import containing, hardly_begun, part_of, simplest
 from magtensor.loop.screening import candidates_of
 from magtensor.loop.spectrum import spectral_lines
 from magtensor.loop.trial import Trial, on_the_folds_of, per_sample, trial
+from magtensor.loop.which_channel import nearest
 
 ROUNDING = 1e-4  # mean square of the whitened residual: far below the least noise that any sensor is believed to have
 
@@ -82,13 +83,13 @@ class Rounds:
             if len(state.adopted) - self.fixed >= self.most_effects or state.residual.square() < ROUNDING:
                 break
             candidates = self.candidates(state, record, how)
-            adopted = _first_kept(record, standing, candidates, how, self.fixed, self.say)
-            steps.append(Step(state, tuple(candidates), *adopted.step))
+            open_ = len(testable(state.excitation, self.models))
+            adopted = _first_kept(record, standing, candidates, how, self.fixed, open_, self.say)
+            steps.append(adopted.step(state, candidates))
             if adopted.standing is not None:
                 record, state = renewed(record, adopted.standing.state, how)
                 standing = replace(adopted.standing, state=state)
                 continue
-            open_ = len(testable(state.excitation, self.models))
             exchanged = None if asked else _exchanged(record, state, steps, how, self.fixed, open_)
             asked = True
             if exchanged is not None:
@@ -182,12 +183,15 @@ class _Kept:
     standing: Trial | None
     chosen: Candidate | None = None
     rivals: tuple[str, ...] = ()
+    channels: tuple[str, ...] = ()
     dropped: tuple[str, ...] = ()
     refused: Mapping[str, str] = field(default_factory=dict)
 
-    @property
-    def step(self) -> tuple[Candidate | None, tuple[str, ...], tuple[str, ...], Mapping[str, str]]:
-        return self.chosen, self.rivals, self.dropped, self.refused
+    def step(self, before: State, candidates: Sequence[Candidate]) -> Step:
+        """The round's story; what follows another channel than its candidate did stands in its place."""
+        kept = self.chosen
+        told = tuple(kept if kept and c.model.name == kept.model.name else c for c in candidates)
+        return Step(before, told, kept, self.rivals, self.dropped, self.refused, channels=self.channels)
 
 
 def _first_kept(
@@ -196,15 +200,17 @@ def _first_kept(
     candidates: Sequence[Candidate],
     how: Fitting,
     fixed: int,
+    models: int,
     say: Callable[[str], None] | None,
 ) -> _Kept:
-    """Fit the candidates that pass, the best first, until one is kept."""
+    """Fit the candidates that pass, found among so many models, the best first, until one is kept."""
     refused: dict[str, str] = {}
     while passing := [c for c in candidates if c.passes and c.model.name not in refused]:
         best = max(passing, key=lambda c: c.assessment.gain.total)
         possible = [c for c in candidates if c.predicts and c.model.name not in refused]
         best = containing(best, possible, before.state)
         chosen, rivals = simplest(best, possible, before.state)
+        chosen, channels = nearest(chosen, before.state, models)
         if say is not None:
             say(f"adopting {chosen.model.name}")
         after, why = _kept(record, before, chosen, how)
@@ -220,7 +226,7 @@ def _first_kept(
         if chosen.model.name in dropped and len(last.adopted) <= len(before.state.adopted):
             refused[chosen.model.name] = "fitted, it does not earn its place on held-out blocks"
             continue
-        return _Kept(after, chosen, rivals, dropped, refused)
+        return _Kept(after, chosen, rivals, channels, dropped, refused)
     return _Kept(None, refused=refused)
 
 

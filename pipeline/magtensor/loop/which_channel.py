@@ -1,0 +1,62 @@
+"""Which of several channels an effect follows, where the survey hardly tells: two thermometers on one payload, say.
+
+A channel that each sensor has of its own is nearer to it than one logged elsewhere, and the others are named.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from magtensor.loop.by_hand import pinned
+from magtensor.loop.excitation import Excitation
+from magtensor.loop.gates import Candidate
+from magtensor.loop.model import State, generic
+from magtensor.loop.profiling import already
+from magtensor.loop.screening import candidates_of
+from magtensor.loop.separation import fold_gain, separated
+from magtensor.loop.settings import AnyChannel, profiled
+from magtensor.loop.several_logs import worse_log
+from magtensor.loop.statistics import Gain
+
+
+def nearest(chosen: Candidate, state: State, models: int) -> tuple[Candidate, tuple[str, ...]]:
+    """A candidate, following the sensors' own channel in the place of one logged elsewhere where held-out blocks do not
+    tell the two apart; and the names of the other channels that they do not tell from it.
+
+    Parameters
+    ----------
+    models: that it was found among, for the correction of p.
+    """
+    component, settings = chosen.model.component, chosen.model.settings
+    name = next((n for n, g in profiled(component).items() if isinstance(g, AnyChannel)), None)
+    if name is None or generic(chosen.model):
+        return chosen, ()
+    reference = _gain(chosen, chosen, state)
+    alike = {str(settings[name]): chosen}
+    for channel in profiled(component)[name].values(state.excitation):
+        if channel in alike or already(state.adopted, component, {**settings, name: channel}):
+            continue
+        for found in candidates_of(state, [pinned(component, {name: channel})], {}, chosen.alpha):
+            model = replace(found.model, component=component, settings={**found.model.settings, name: channel})
+            other = replace(found.among(models), model=model)
+            gain = _gain(other, chosen, state)
+            behind = reference.over(gain).total
+            if other.passes and (not separated(reference, gain) or worse_log(chosen, other, behind, state)):
+                alike[channel] = other
+    own = [channel for channel in alike if _of_each_sensor(state.excitation, channel)]
+    which = str(settings[name]) if not own or settings[name] in own else max(own, key=lambda c: _total(alike[c]))
+    return alike[which], tuple(sorted(set(alike) - {which}))
+
+
+def _gain(candidate: Candidate, chosen: Candidate, state: State) -> Gain:
+    return fold_gain(candidate.before or state, chosen.assessment.colours, candidate.terms)
+
+
+def _total(candidate: Candidate) -> float:
+    return candidate.assessment.gain.total
+
+
+def _of_each_sensor(x: Excitation, channel: str) -> bool:
+    """Whether a channel has a value for each sensor."""
+    values = x.logged[channel]
+    return values.ndim == 2 and not x.is_vector(channel)
