@@ -203,11 +203,14 @@ def summary(verdict: dict[str, Any]) -> str:
             f"held-out residual {figure(before)} -> {figure(after)} nT",
             *([f"z {evidence['z']:.3g}"] if evidence["z"] is not None else []),
             *([f"not told from {', '.join(rivals)}"] if rivals else []),
-            *([f"following {' or '.join(others)} it would do as well"] if others else []),
+            *([f"its channel not told from {', '.join(others)}"] if others else []),
         ]
         lines.append(f"  adopted {one['error_model']}: {'; '.join(words)}")
-    if verdict["rejected"]:
-        lines.append(f"  looked at and not adopted: {', '.join(r['error_model'] for r in verdict['rejected'])}")
+    looked_at = {c["error_model"] for step in verdict.get("steps", []) for c in step["looked_at"]}
+    if rejected := [
+        r["error_model"] for r in verdict["rejected"] if r["error_model"] in looked_at or r.get("by") == "person"
+    ]:
+        lines.append(f"  looked at and not adopted: {', '.join(rejected)}")
     if verdict["not_tested"]:
         missing = ", ".join(f"{n['error_model']} ({' and '.join(n['missing'])})" for n in verdict["not_tested"])
         lines.append(f"  not tested for want of channels: {missing}")

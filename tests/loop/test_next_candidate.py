@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from loop_cases import BASE, adopted_names, linear_state, scenario, synthetic, verdict_of
+from loop_cases import BASE, adopted_names, lasting_effects, linear_state, scenario, synthetic, verdict_of
 
 from magtensor.loop import rivals, rounds
 from magtensor.loop.model import Adopted, Fitting, Record, State
@@ -99,3 +99,17 @@ def test_it_is_told_why_a_part_was_not_tried(tmp_path: Path, monkeypatch: pytest
     assert not adopted_names(told)
     first, second = sorted(told["steps"][0]["refused"].items(), key=lambda named: named[1] != "refused")
     assert first[1] == "refused" and second[1] == f"a small part of what {first[0]} explains, which failed"
+
+
+def test_every_model_is_adopted_rejected_or_not_tested(tmp_path: Path) -> None:
+    """Those that explain too little to be looked at closely among them."""
+    survey = scenario(33, *EFFECTS, motion=BASE["motion"] | {"duration_s": 600.0})
+    told = verdict_of(tmp_path, survey, models=lasting_effects())
+
+    why = {r["error_model"]: r["why"] for r in told["rejected"]}
+    named = [*adopted_names(told), *why, *(n["error_model"] for n in told["not_tested"])]
+    assert set(named) | {"latent_source"} == set(lasting_effects())  # that one is asked for in a way of its own
+    assert len(named) == len(set(named))
+    screened = {name for name, told in why.items() if told.startswith("screened")}
+    looked_at = {c["error_model"] for step in told["steps"] for c in step["looked_at"]}
+    assert screened and not screened & looked_at

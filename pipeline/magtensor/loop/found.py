@@ -22,6 +22,7 @@ class Step:
         refused: model -> why it was not kept after it had been fitted.
         among: the sensors looked at, where some that wander were left out; () where all were.
         channels: others that the data do not separate from the one that it follows.
+        screened: names of the models that were tried with every setting, those looked at closely among them.
     """
 
     before: State
@@ -32,6 +33,7 @@ class Step:
     refused: Mapping[str, str] = field(default_factory=dict)
     among: tuple[str, ...] = ()
     channels: tuple[str, ...] = ()
+    screened: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -131,9 +131,10 @@ def z_of(p: float) -> float | None:
 
 
 def _rejected(found: Search) -> list[dict[str, Any]]:
-    """Every model looked at closely and not adopted, as it stood in the last round that looked at it."""
+    """Every model that was tried and not adopted, as it stood in the last round that looked at it closely."""
     adopted = {a.name for a in found.last.adopted}
     last: dict[str, str] = {}
+    looked_at = {c.model.name for step in found.steps for c in step.candidates}
     for number, step in enumerate(found.steps, 1):
         for candidate in step.candidates:
             if step.adopted is None or candidate is not step.adopted:
@@ -142,10 +143,11 @@ def _rejected(found: Search) -> list[dict[str, Any]]:
             last[name] = f"round {number}: {reason}"
         for name in set(step.dropped) - set(step.refused):
             last[name] = f"round {number}: dropped, no longer significant beside the others"
+    for name in {name for step in found.steps for name in step.screened}:
+        last.setdefault(name, "screened with every setting: it explains too little to be looked at closely")
     if found.shared is not None and found.shared.significant:
         last[NAME] = found.shared.objection or "not among the models that may be adopted"
-    for name, reason in found.failed.items():
-        last.setdefault(name, f"could not be tried: {reason}")
+    last |= {name: f"could not be tried: {reason}" for name, reason in found.failed.items() if name not in looked_at}
     return [{"error_model": n, "why": w} for n, w in sorted(last.items()) if n not in adopted]
 
 

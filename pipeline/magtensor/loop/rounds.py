@@ -69,8 +69,13 @@ class Rounds:
 
     def candidates(self, state: State, record: Record, how: Fitting) -> list[Candidate]:
         """What may be adopted beside what is."""
-        open_ = open_models(testable(state.excitation, self.models), state)
-        return at_their_own_fit(candidates_of(state, open_, self.failed, self.alpha), record, state, how)
+        found = candidates_of(state, self.open_models(state), self.failed, self.alpha)
+        return at_their_own_fit(found, record, state, how)
+
+    def open_models(self, state: State) -> list[Component]:
+        """The models that have what they need and are not in already, or can be in more than once."""
+        taken = {a.name for a in state.adopted}
+        return [m for m in testable(state.excitation, self.models) if m.name not in taken or repeatable(m)]
 
     def run(self, record: Record, state: State, how: Fitting) -> Ended:
         """Adopt the best, refit, repeat, until nothing is left that the data want."""
@@ -85,7 +90,8 @@ class Rounds:
             candidates = self.candidates(state, record, how)
             open_ = len(testable(state.excitation, self.models))
             adopted = _first_kept(record, standing, candidates, how, self.fixed, open_, self.say)
-            steps.append(adopted.step(state, candidates))
+            step = adopted.step(state, candidates)
+            steps.append(replace(step, screened=tuple(m.name for m in self.open_models(state))))
             if adopted.standing is not None:
                 record, state = renewed(record, adopted.standing.state, how)
                 standing = replace(adopted.standing, state=state)
@@ -271,12 +277,6 @@ def _kept(record: Record, before: Trial, chosen: Candidate, how: Fitting) -> tup
 def testable(x: Excitation, models: Sequence[Component]) -> list[Component]:
     """The models that have what they need, beside what is adopted."""
     return [m for m in models if not missing(m, x)]
-
-
-def open_models(testable: Sequence[Component], state: State) -> list[Component]:
-    """Those that are not in already, or can be in more than once."""
-    taken = {a.name for a in state.adopted}
-    return [m for m in testable if m.name not in taken or repeatable(m)]
 
 
 def with_lines(state: State, record: Record, lines: Sequence[float] | None = None) -> State:
