@@ -37,9 +37,10 @@ def test_of_four_sensors_each_has_its_own(turning_rad_s: float, levels: float) -
 
 
 @pytest.mark.parametrize("turning_rad_s", [0.1, 0.5, 3.0])
-def test_of_two_sensors_the_noise_is_that_of_their_contrast(turning_rad_s: float) -> None:
-    found = output_noise(outputs([150.0, 550.0], turning_rad_s))
-    assert found == pytest.approx(np.sqrt((150.0**2 + 550.0**2) / 2.0), rel=0.05)
+@pytest.mark.parametrize("noise", [[150.0, 550.0], [330.0, 17.0]])  # beside the quiet one, the other's is no field
+def test_of_two_sensors_the_noise_is_that_of_their_contrast(noise: list[float], turning_rad_s: float) -> None:
+    found = output_noise(outputs(noise, turning_rad_s))
+    assert found == pytest.approx(np.sqrt(np.mean(np.square(noise))), rel=0.05)
 
 
 def test_a_current_that_no_model_knows_is_no_noise() -> None:

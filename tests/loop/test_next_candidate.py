@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from loop_cases import BASE, adopted_names, lasting_effects, linear_state, scenario, synthetic, verdict_of
 
-from magtensor.loop import rivals, rounds
+from magtensor.loop import by_hand, rivals, rounds
+from magtensor.loop.gates import ALPHA
 from magtensor.loop.model import Adopted, Fitting, Record, State
 from magtensor.loop.terms import Terms
 from magtensor.registry import Registry
@@ -113,3 +114,19 @@ def test_every_model_is_adopted_rejected_or_not_tested(tmp_path: Path) -> None:
     screened = {name for name, told in why.items() if told.startswith("screened")}
     looked_at = {c["error_model"] for step in told["steps"] for c in step["looked_at"]}
     assert screened and not screened & looked_at
+
+
+@pytest.mark.parametrize(("rises", "part"), [(lambda t: t, "offset_drift"), (lambda t: np.sign(t - 0.1), "")])
+def test_a_step_is_no_part_of_a_drift_unless_it_is(rises: Any, part: str) -> None:
+    """An offset that rises all the time has a place where it seems to step, and one that steps is no drift."""
+    added = np.zeros((1200, 4, 3))
+    added[:, 0] = 1.5 * rises(np.linspace(-1.0, 1.0, 1200))[:, None] * np.array([1.0, -0.5, 0.7])
+    state = linear_state(synthetic(9, added=added))
+    found = [
+        by_hand.candidate(Registry.load().find("error_model", name), {}, state, 30, ALPHA)
+        for name in ("offset_step", "offset_drift", "scale_drift")
+    ]
+    step, drift, _ = found
+    assert step.assessment.gain.total > 100.0 and drift.assessment.gain.total > 100.0
+    assert rivals.part_of_a_drift(step, found, state) == part
+    assert not rivals.part_of_a_drift(drift, found, state)  # it lasts

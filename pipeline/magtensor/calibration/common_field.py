@@ -21,7 +21,6 @@ from .types import Array, Mask
 LEAST_SAMPLES_PER_AXIS = 20  # below this the noise is taken as equal on all axes of the array
 LEAST_SHARE = 0.05  # of its sensor's mean noise variance: a smaller estimate is a Heywood case, not a quiet axis
 QUIETEST = 1e-4  # the same of a sensor among all: noise levels differ by factors of 30, and one of zero weighs all
-_CLEAR = 30.0  # times the noise variance in each direction of the plane: then it is the field's
 _ALIKE = 0.98  # cosine of the largest angle between two planes
 _CHUNK = 65536
 
@@ -117,13 +116,18 @@ def output_noise(raw: Array, keep: Mask | None = None, run: NDArray[np.int_] | N
         among = None
     second = np.diff(raw, n=2, axis=0) / np.sqrt(6.0)
     found = common_field(second, keep=among)
-    moves = second if among is None else second[among]
-    if np.mean(found.coordinates(moves) ** 2, axis=0).min() < _CLEAR:
-        outputs = _plane(_factor(raw if keep is None else raw[keep])[1])[0]
-        own = np.linalg.qr(found.noise[:, None] * found.basis)[0]
-        if np.linalg.svd(own.T @ outputs)[1].min() < _ALIKE:
-            return _with_noise(_factor(moves)[1], len(moves), outputs)[0].reshape(raw.shape[1], 3)
+    own, outputs = np.linalg.qr(found.noise[:, None] * found.basis)[0], _widest(raw if keep is None else raw[keep])
+    if np.linalg.svd(own.T @ outputs)[1].min() < _ALIKE:
+        moves = second if among is None else second[among]
+        return _with_noise(_factor(moves)[1], len(moves), outputs)[0].reshape(raw.shape[1], 3)
     return found.noise.reshape(raw.shape[1], 3)
+
+
+def _widest(raw: Array) -> Array:
+    """(3 S, 3) orthonormal: in which directions raw outputs (N, S, 3) nT move most."""
+    flat = raw.reshape(len(raw), -1)
+    flat = flat - flat.mean(axis=0)
+    return np.asarray(np.linalg.eigh(flat.T @ flat)[1][:, -3:])
 
 
 def _handed(basis: Array) -> Array:

@@ -74,10 +74,35 @@ def containing(best: Candidate, possible: Sequence[Candidate], state: State) -> 
 
 def part_of(candidate: Candidate, other: Candidate, state: State) -> bool:
     """Whether a candidate predicts a small part of what another one does, and next to nothing beside it."""
-    colours = other.assessment.colours
-    whole, own = (fold_gain(state, colours, c.terms).total for c in (other, candidate))
-    beside = fold_gain(state, colours, other.terms, candidate.terms).total - whole
-    return own < SMALL_PART * whole and beside < SMALL_PART * own
+    whole, own, both = _beside(candidate, other, state)
+    return own < SMALL_PART * whole and both - whole < SMALL_PART * own
+
+
+def part_of_a_drift(candidate: Candidate, candidates: Sequence[Candidate], state: State) -> str:
+    """The name of a model of what lasts that predicts as much as a candidate of what happened once, and leaves it
+    next to nothing; "" where there is none.
+
+    A drift is judged by the scatter of long blocks, which tells little of it, and something that happened once is not.
+    Where a drift predicts more on blocks that neither has seen, the event is the place where it is steepest.
+    """
+    if not happens_once(candidate.model):
+        return ""
+    least = candidate.assessment.gain.total
+    for other in candidates:
+        gain = other.assessment.gain
+        if happens_once(other.model) or generic(other.model) or gain.total < least or not gain.consistent:
+            continue
+        whole, own, both = _beside(candidate, other, state)
+        if own <= whole and both - whole < SMALL_PART * own:
+            return other.model.name
+    return ""
+
+
+def _beside(candidate: Candidate, other: Candidate, state: State) -> tuple[float, float, float]:
+    """What another model, a candidate and both together predict, in noise of the colour that the other leaves."""
+    each = ([other.terms], [candidate.terms], [other.terms, candidate.terms])
+    whole, own, both = (fold_gain(state, other.assessment.colours, *terms).total for terms in each)
+    return whole, own, both
 
 
 def begun(candidate: Candidate) -> int:

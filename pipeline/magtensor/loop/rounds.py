@@ -20,7 +20,7 @@ from magtensor.loop.model import Fitting, Record, State, generic
 from magtensor.loop.needs import missing
 from magtensor.loop.own_fit import at_their_own_fit
 from magtensor.loop.profiling import already, repeatable
-from magtensor.loop.rivals import containing, hardly_begun, part_of, simplest
+from magtensor.loop.rivals import containing, hardly_begun, part_of, part_of_a_drift, simplest
 from magtensor.loop.screening import candidates_of
 from magtensor.loop.spectrum import spectral_lines
 from magtensor.loop.trial import Trial, on_the_folds_of, per_sample, trial
@@ -216,6 +216,9 @@ def _first_kept(
         possible = [c for c in candidates if c.predicts and c.model.name not in refused]
         best = containing(best, possible, before.state)
         chosen, rivals = simplest(best, possible, before.state)
+        if name := part_of_a_drift(chosen, candidates, before.state):
+            refused[chosen.model.name] = f"{name}, which lasts, predicts as much"
+            continue
         chosen, channels = nearest(chosen, before.state, models)
         if say is not None:
             say(f"adopting {chosen.model.name}")

@@ -14,7 +14,7 @@ from magtensor.loop.model import State, generic
 from magtensor.loop.profiling import already
 from magtensor.loop.screening import candidates_of
 from magtensor.loop.separation import fold_gain, separated
-from magtensor.loop.settings import AnyChannel, profiled
+from magtensor.loop.settings import AnyChannel, Orders, profiled
 from magtensor.loop.several_logs import worse_log
 from magtensor.loop.statistics import Gain
 
@@ -33,11 +33,13 @@ def nearest(chosen: Candidate, state: State, models: int) -> tuple[Candidate, tu
         return chosen, ()
     reference = _gain(chosen, chosen, state)
     alike = {str(settings[name]): chosen}
+    orders = {n: settings[n] for n, g in profiled(component).items() if isinstance(g, Orders)}
     for channel in profiled(component)[name].values(state.excitation):
-        if channel in alike or already(state.adopted, component, {**settings, name: channel}):
+        held = {**orders, name: channel}
+        if channel in alike or already(state.adopted, component, {**settings, **held}):
             continue
-        for found in candidates_of(state, [pinned(component, {name: channel})], {}, chosen.alpha):
-            model = replace(found.model, component=component, settings={**found.model.settings, name: channel})
+        for found in candidates_of(state, [pinned(component, held)], {}, chosen.alpha):
+            model = replace(found.model, component=component, settings={**settings, **found.model.settings, **held})
             other = replace(found.among(models), model=model)
             gain = _gain(other, chosen, state)
             behind = reference.over(gain).total
