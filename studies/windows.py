@@ -54,8 +54,6 @@ def parts() -> list[Part]:
     balloon = [(900, 2100), (2100, 3300), (3300, 4600), (900, 2750), (2750, 4600)]
     quadcopter = [(0, 75), (30, 110), (70, 145), (0, 145)]
     return [
-        *(Part("loop_balloon", *window) for window in balloon),
-        *(Part("loop_balloon", *balloon[-2], sensor) for sensor in ("RM3100", "AK09916")),
         *(Part("loop_quadcopter", *window) for window in quadcopter),
         *(Part("loop_quadcopter", *quadcopter[-1], sensor) for sensor in ("external", "internal")),
         *(Part("broad", file=name) for name in BROAD),
@@ -64,6 +62,8 @@ def parts() -> list[Part]:
         *(Part("conrad", hour * HOUR_S, (hour + 4) * HOUR_S) for hour in (0, 8, 16)),
         Part("conrad"),
         *(Part("conrad", sensor=sensor) for sensor in ("FGE", "LEMI036")),
+        *(Part("loop_balloon", *window) for window in balloon),
+        *(Part("loop_balloon", *balloon[-2], sensor) for sensor in ("RM3100", "AK09916")),
     ]
 
 
