@@ -290,9 +290,10 @@ def test_the_loops_findings_are_shown(whole_survey: Survey, written: Write) -> N
         "adopted": [
             {"error_model": "temperature_offset", "sensors": ["S1"], "settings": {"lag_s": 118.0},
              "coefficients": [{"name": "x", "sensor": "S1", "value": 1.02, "std": 0.004, "units": "nT/degC"}],
-             "evidence": {"z": 11.8}, "indistinguishable_from": ["warm_up"]}
+             "evidence": {"z": 11.8}, "indistinguishable_from": ["warm_up"], "channels_as_good": ["box_degC"]}
         ],
-        "rejected": [{"error_model": "eddy_current", "why": "no gain on held-out blocks"}],
+        "rejected": [{"error_model": "eddy_current", "why": "no gain on held-out blocks"},
+                     {"error_model": "bandwidth", "why": "screened"}, {"error_model": "warm_up", "why": "screened"}],
         "not_tested": [{"error_model": "current_field", "missing": ["current_*"]}],
         "unexplained": {"present": True, "excess_rms_nT": 0.21, "description": "a line at 0.5 Hz in S2"},
         "error": {"fit": None, "held_out": {"before": block, "after": better}},
@@ -300,6 +301,7 @@ def test_the_loops_findings_are_shown(whole_survey: Survey, written: Write) -> N
     text = words(parsed(write_report(written(whole_survey, outcome=outcome))))
     for expected in (
         "temperature_offset", "lag_s: 118", "S1 x: 1.0200 ± 0.0040 nT/degC", "warm_up", "eddy_current: no gain",
+        "bandwidth, warm_up: screened", "nor its channel from box_degC",
         "current_field: the survey has no current_*", "a line at 0.5 Hz in S2", "0.21 nT rms above the noise",
         "held-out blocks: declared model", "held-out blocks: with adopted effects", "0.0321",
     ):  # fmt: skip
