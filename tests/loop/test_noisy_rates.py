@@ -4,10 +4,12 @@ no fit may follow it."""
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from loop_cases import Array, synthetic
+from loop_cases import BASE, Array, scenario, synthetic, verdict_of
 
 from magtensor.loop.assessment import estimated
 from magtensor.loop.model import Adopted, Fitting, Record, joint_state
@@ -17,6 +19,7 @@ from magtensor.registry import Registry
 NOISE_NT = (150.0, 550.0)
 LATE_S = ((0.0, 0.0, 0.0), (0.012, 0.009, 0.004))
 RATE_HZ, SAMPLES = 10.0, 6000
+SLOWLY = {"type": "tumbling", "duration_s": 500.0, "rate_rms_deg_s": 8.0, "rate_time_s": 3.0}
 EARTH_NT = np.array([21_000.0, 1_500.0, 47_500.0])
 
 
@@ -86,3 +89,25 @@ def test_the_noise_in_a_regressor_is_what_another_draw_of_the_noise_changes() ->
         differ = np.mean((first.series - other.series) ** 2, axis=0) / 2.0 / first.series.var(axis=0)
         np.testing.assert_allclose(first.noise, differ, rtol=0.2)
         assert 1e-6 < differ.min() < differ.max() < 0.1
+
+
+@pytest.mark.parametrize(
+    ("noise_nT", "motion"),
+    [
+        ((330.0, 17.0), {"type": "limited_tilt", "duration_s": 500.0}),
+        ((21.0, 210.0, 17.0, 66.0), SLOWLY),
+        ((260.0, 170.0, 11.0), SLOWLY),
+    ],
+)
+def test_nothing_is_left_of_sensors_as_unequal_as_they_come(
+    tmp_path: Path, noise_nT: tuple[float, ...], motion: dict[str, Any]
+) -> None:
+    """Ten rows a second of an array that turns slowly: the field moves by less than the noise of the worst."""
+    places = np.random.default_rng(2).normal(scale=0.4, size=(len(noise_nT), 3)).round(2).tolist()
+    instrument = BASE["instrument"] | {
+        "array": {"positions_m": places},
+        "noise": {"white_sd_nT": [[noise] * 3 for noise in noise_nT]},
+    }
+    told = verdict_of(tmp_path, scenario(11, instrument=instrument, motion=motion, rate_Hz=10.0))
+    assert not told["adopted"] and not told["unexplained"]["present"]
+    assert told["noise_floor_nT"] == pytest.approx(np.sqrt(np.mean(np.square(noise_nT))), rel=0.1)
