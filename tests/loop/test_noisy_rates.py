@@ -96,7 +96,7 @@ def test_the_noise_in_a_regressor_is_what_another_draw_of_the_noise_changes() ->
     [
         ((330.0, 17.0), {"type": "limited_tilt", "duration_s": 500.0}),
         ((21.0, 210.0, 17.0, 66.0), SLOWLY),
-        ((260.0, 170.0, 11.0), SLOWLY),
+        pytest.param((260.0, 170.0, 11.0), SLOWLY, marks=pytest.mark.long),
     ],
 )
 def test_nothing_is_left_of_sensors_as_unequal_as_they_come(
