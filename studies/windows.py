@@ -51,7 +51,7 @@ class Part(NamedTuple):
 
 def parts() -> list[Part]:
     """All of them."""
-    balloon = [(900, 2100), (2100, 3300), (3300, 4600), (900, 2750), (2750, 4600)]
+    balloon = [(900, 2100), (3300, 4600), (2100, 3300), (900, 2750), (2750, 4600)]
     quadcopter = [(0, 75), (30, 110), (70, 145), (0, 145)]
     return [
         *(Part("loop_quadcopter", *window) for window in quadcopter),
@@ -60,10 +60,10 @@ def parts() -> list[Part]:
         *(Part("boulder", day * DAY_S, (day + 7) * DAY_S) for day in (0, 7, 14, 21)),
         Part("boulder"),
         *(Part("conrad", hour * HOUR_S, (hour + 4) * HOUR_S) for hour in (0, 8, 16)),
-        *(Part("conrad", sensor=sensor) for sensor in ("FGE", "LEMI036")),
         *(Part("loop_balloon", *window) for window in balloon),
         *(Part("loop_balloon", *balloon[-2], sensor) for sensor in ("RM3100", "AK09916")),
         Part("conrad"),
+        *(Part("conrad", sensor=sensor) for sensor in ("FGE", "LEMI036")),
     ]
 
 

@@ -21,7 +21,8 @@ from magtensor.loop.statistics import Gain
 
 def nearest(chosen: Candidate, state: State, models: int) -> tuple[Candidate, tuple[str, ...]]:
     """A candidate, following the sensors' own channel in the place of one logged elsewhere where held-out blocks do not
-    tell the two apart; and the names of the other channels that they do not tell from it.
+    tell the two apart; and the names of the other channels that they do not tell from it. One that slow noise could
+    explain is named, and not taken.
 
     Parameters
     ----------
@@ -43,15 +44,18 @@ def nearest(chosen: Candidate, state: State, models: int) -> tuple[Candidate, tu
             other = replace(found.among(models), model=model)
             gain = _gain(other, chosen, state)
             behind = reference.over(gain).total
-            if other.passes and (not separated(reference, gain) or worse_log(chosen, other, behind, state)):
+            if other.predicts and (not separated(reference, gain) or worse_log(chosen, other, behind, state)):
                 alike[channel] = other
-    own = [channel for channel in alike if _of_each_sensor(state.excitation, channel)]
+    own = [c for c, found in alike.items() if found.passes and _of_each_sensor(state.excitation, c)]
     which = str(settings[name]) if not own or settings[name] in own else max(own, key=lambda c: _total(alike[c]))
     return alike[which], tuple(sorted(set(alike) - {which}))
 
 
 def _gain(candidate: Candidate, chosen: Candidate, state: State) -> Gain:
-    return fold_gain(candidate.before or state, chosen.assessment.colours, candidate.terms)
+    """In noise of the colour that the chosen one leaves, beside the fit without either: one of them may have been
+    judged at its own."""
+    terms = candidate.model.terms(state.excitation).at(state.residual.samples)
+    return fold_gain(state, chosen.assessment.colours, terms)
 
 
 def _total(candidate: Candidate) -> float:
