@@ -3,9 +3,10 @@
     python studies/windows.py --rows build/windows.jsonl --page docs/measured/windows.md [--only balloon]
 
 Every part is loaded as the recipe of its recording says and goes through the stages of `recipes/closed_loop.yaml`, with
-nothing else declared or left out. No threshold of the loop was set on them. Parts of a recording should tell the same:
+nothing else declared or left out. No number was set on them, but what the balloon's parts showed led to three rules (the
+noise of rates of change, parts of what failed, events that a drift predicts), of which its rows are no test. Parts of a recording should tell the same:
 what one of them adopts and no other bears out is either weak there or an accusation. The recordings are not part of the
-project (docs/measured/README.md).
+project (docs/measured/README.md). Parts that are not in the table were not waited for.
 """
 
 from __future__ import annotations
@@ -134,9 +135,11 @@ def _rms(block: dict[str, Any] | None) -> str:
 def _effect(one: dict[str, Any]) -> str:
     settings = one["settings"]
     channel = f" of {settings['channel']}" if "channel" in settings else ""
-    same = [*one["indistinguishable_from"], *(f"of {c}" for c in one.get("channels_as_good", []))]
+    rivals, channels = one["indistinguishable_from"], one.get("channels_as_good", [])
+    same = f", not told from {', '.join(rivals)}" if rivals else ""
+    same += f", its channel not from {', '.join(channels)}" if channels else ""
     where = f" ({', '.join(one['sensors'])})" if one["sensors"] else ""
-    return f"`{one['error_model']}`{channel}{where}{', not told from ' + ', '.join(same) if same else ''}"
+    return f"`{one['error_model']}`{channel}{where}{same}"
 
 
 def table(rows: list[dict[str, Any]]) -> str:
