@@ -3,10 +3,11 @@
     python studies/windows.py --rows build/windows.jsonl --page docs/measured/windows.md [--only balloon]
 
 Every part is loaded as the recipe of its recording says and goes through the stages of `recipes/closed_loop.yaml`, with
-nothing else declared or left out. No number was set on them, but what the balloon's parts showed led to three rules (the
-noise of rates of change, parts of what failed, events that a drift predicts), of which its rows are no test. Parts of a recording should tell the same:
-what one of them adopts and no other bears out is either weak there or an accusation. The recordings are not part of the
-project (docs/measured/README.md). Parts that are not in the table were not waited for.
+nothing else declared or left out. No number was set on them, but what the balloon's parts showed led to three rules
+(the noise of rates of change, parts of what failed, events that a drift predicts), of which its rows are no test. Parts
+of a recording should tell the same: what one of them adopts and no other bears out is either weak there or an
+accusation. The recordings are not part of the project (docs/measured/README.md). Parts that are not in the table were
+not waited for.
 """
 
 from __future__ import annotations
