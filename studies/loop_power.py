@@ -47,8 +47,9 @@ from magtensor.errors import MagtensorError
 from magtensor.loop.assessment import Colours, colours_of, estimated, explained
 from magtensor.loop.colour import Colour
 from magtensor.loop.found import Search
-from magtensor.loop.model import Fitting, Record, State, joint_state
+from magtensor.loop.model import Fitting, Record, State
 from magtensor.loop.outcome import why
+from magtensor.loop.refit import joint_state
 from magtensor.loop.residual import Residual
 from magtensor.loop.search import search
 from magtensor.loop.turned import TurnedColour

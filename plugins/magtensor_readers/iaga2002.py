@@ -56,8 +56,8 @@ def _contents(path: Path) -> Iterator[tuple[str, bytes]]:
                         f"{member.filename} would unpack to {member.file_size / 2**30:.0f} GiB", where=path.name
                     )
                 yield f"{path.name}/{member.filename}", archive.read(member)
-    # zipfile raises RuntimeError for an encrypted member, NotImplementedError for a compression it does not know
-    except (zipfile.BadZipFile, RuntimeError, NotImplementedError, OSError, EOFError) as error:
+    # zipfile raises RuntimeError for an encrypted member, and a kind of it for a compression it does not know
+    except (zipfile.BadZipFile, RuntimeError, OSError, EOFError) as error:
         raise DataError(f"the archive cannot be unpacked: {error}", where=path.name) from error
     except Exception as error:
         if type(error).__module__ == "zlib":  # zlib.error is no subclass of anything more telling

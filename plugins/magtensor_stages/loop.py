@@ -72,9 +72,10 @@ def close_loop(
     from magtensor.loop.decisions import Decision, decision_of
     from magtensor.loop.errors_before_after import folds_for, held_out_error
     from magtensor.loop.inquiry import inquiry_of
-    from magtensor.loop.model import Fitting, with_colour
+    from magtensor.loop.model import Fitting
     from magtensor.loop.near_nominal import doubt_of, labelled, settled
     from magtensor.loop.own_noise import OwnNoise
+    from magtensor.loop.refit import with_colour
     from magtensor.loop.stored import cleaned, effect_variables
     from magtensor.loop.unexplained import unexplained
     from magtensor.tensors import slow_noise_variables

@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from magtensor.loop.model import Fitting, Record, State, joint_state
+from magtensor.loop.model import Fitting, Record, State
 from magtensor.loop.record import record_of
+from magtensor.loop.refit import joint_state
 from magtensor.loop.settings import EventTimes, profiled
 from magtensor.preparing import empty_survey, load_as
 from magtensor.recipe.plan import read_plan

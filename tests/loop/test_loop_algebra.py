@@ -14,10 +14,11 @@ from magtensor.loop.assessment import Colours, colours_of, estimated, explained
 from magtensor.loop.colour import Colour
 from magtensor.loop.evidence import grams, held_out, normal
 from magtensor.loop.excitation import Excitation
-from magtensor.loop.model import Fitting, Record, excitation_of
+from magtensor.loop.model import Fitting, Record
 from magtensor.loop.residual import Residual, residual_of, taken_off
 from magtensor.loop.scoring import Scorer, rarity
 from magtensor.loop.search import search
+from magtensor.loop.seen import excitation_of
 from magtensor.loop.statistics import own_information, solve
 from magtensor.loop.terms import REFERENCE, Terms, joined
 

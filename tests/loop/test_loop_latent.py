@@ -13,7 +13,8 @@ from magtensor.calibration.types import ArrayCalibration
 from magtensor.loop.correction import corrected_raw, hidden_waveform
 from magtensor.loop.factor import noise_alone, with_factor
 from magtensor.loop.latent import ALPHA, shared_words, sought, tried_source
-from magtensor.loop.model import Adopted, Fitting, Record, joint_state
+from magtensor.loop.model import Adopted, Fitting, Record
+from magtensor.loop.refit import joint_state
 from magtensor.loop.switching import two_levels
 from magtensor.loop.waveform import course_of, free_directions
 from magtensor.registry import Registry

@@ -10,7 +10,8 @@ from loop_cases import BASE, loaded, scenario
 
 from magtensor.loop.found import Search
 from magtensor.loop.long_record import on_every_sample, part_of
-from magtensor.loop.model import Fitting, joint_state
+from magtensor.loop.model import Fitting
+from magtensor.loop.refit import joint_state
 from magtensor.loop.search import search
 from magtensor.loop.unexplained import unexplained
 from magtensor.registry import Registry

@@ -16,8 +16,9 @@ from scipy.stats import norm
 from magtensor.calibration.joint import calibrated
 from magtensor.loop.colour import Colour, colour_of
 from magtensor.loop.correction import corrected_raw
-from magtensor.loop.model import Adopted, Fitting, joint_state
+from magtensor.loop.model import Adopted, Fitting
 from magtensor.loop.multiplicity import effective_tests
+from magtensor.loop.refit import joint_state
 from magtensor.loop.scoring import rarity
 from magtensor.loop.smoothing import smoothed
 from magtensor.loop.turned import SlowModes, TurnedColour, excess_of, excess_of_one

@@ -12,7 +12,7 @@ from loop_cases import scenario, survey_file
 import magtensor
 from magtensor.applying import apply_to
 from magtensor.effect_errors import COVARIANCE
-from magtensor.loop.model import without_noise
+from magtensor.loop.refit import without_noise
 from magtensor.loop.statistics import Estimate
 from magtensor.result import open_result
 from magtensor.survey.model import without_variables

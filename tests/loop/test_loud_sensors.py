@@ -11,7 +11,8 @@ from loop_cases import linear_state, scenario, survey_file, synthetic, verdict_o
 
 import magtensor
 from magtensor.loop.contribution import eliminate, removal
-from magtensor.loop.model import Adopted, Fitting, joint_state
+from magtensor.loop.model import Adopted, Fitting
+from magtensor.loop.refit import joint_state
 from magtensor.loop.statistics import symmetric_eigen
 from magtensor.registry import Registry
 

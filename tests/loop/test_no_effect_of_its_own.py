@@ -16,7 +16,8 @@ from loop_cases import Array, adopted_names, linear_state, scenario, synthetic, 
 from magtensor.loop.errors_before_after import folds_for
 from magtensor.loop.gates import OF_THE_LAW, Candidate, adds_to_axes
 from magtensor.loop.kin import drivers, explained_by_kin
-from magtensor.loop.model import Adopted, Fitting, Record, State, joint_state
+from magtensor.loop.model import Adopted, Fitting, Record, State
+from magtensor.loop.refit import joint_state
 from magtensor.registry import Registry
 
 COURSE = np.sin(np.arange(1200) / 200.0)

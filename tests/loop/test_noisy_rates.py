@@ -12,7 +12,8 @@ import pytest
 from loop_cases import BASE, Array, scenario, synthetic, verdict_of
 
 from magtensor.loop.assessment import estimated
-from magtensor.loop.model import Adopted, Fitting, Record, joint_state
+from magtensor.loop.model import Adopted, Fitting, Record
+from magtensor.loop.refit import joint_state
 from magtensor.loop.terms import joined
 from magtensor.registry import Registry
 

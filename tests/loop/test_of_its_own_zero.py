@@ -9,9 +9,10 @@ import pytest
 from loop_cases import Array, synthetic
 
 from magtensor.loop.adopting import on_those_that_show
-from magtensor.loop.model import Adopted, Fitting, Record, joint_state
+from magtensor.loop.model import Adopted, Fitting, Record
 from magtensor.loop.outcome import judgement
 from magtensor.loop.record import origin
+from magtensor.loop.refit import joint_state
 from magtensor.loop.rounds import with_lines
 from magtensor.loop.screening import candidates_of
 from magtensor.loop.search import search

@@ -10,8 +10,9 @@ from loop_cases import BASE, adopted_names, loaded, scenario, verdict_of
 
 from magtensor.loop import search
 from magtensor.loop.found import Search
-from magtensor.loop.model import Adopted, Fitting, joint_state
+from magtensor.loop.model import Adopted, Fitting
 from magtensor.loop.overshadowed import attitude_share
+from magtensor.loop.refit import joint_state
 from magtensor.registry import Registry
 
 MODELS = ("nonlinearity_quadratic", "nonlinearity_cubic", "current_field", "site_gradient")

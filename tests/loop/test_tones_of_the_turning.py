@@ -12,8 +12,9 @@ from loop_cases import BASE, Array, adopted_names, loaded, scenario, verdict_of
 from scipy.spatial.transform import Rotation
 
 from magtensor.loop.direction import turning_Hz
-from magtensor.loop.model import Adopted, Fitting, joint_state
+from magtensor.loop.model import Adopted, Fitting
 from magtensor.loop.overshadowed import _of_the_attitude
+from magtensor.loop.refit import joint_state
 from magtensor.registry import Registry
 
 RATES = 2 * np.pi / 40.0 * np.array([1.0, 0.61, 0.37])  # rad/s about z, y and x

@@ -14,8 +14,9 @@ from magtensor.loop.assessment import WHITE
 from magtensor.loop.errors_before_after import folds_for
 from magtensor.loop.evidence import grams
 from magtensor.loop.gates import ALPHA, SECOND_ORDER, Candidate
-from magtensor.loop.model import Adopted, Fitting, Record, joint_state
+from magtensor.loop.model import Adopted, Fitting, Record
 from magtensor.loop.outcome import why
+from magtensor.loop.refit import joint_state
 from magtensor.loop.screening import candidates_of
 from magtensor.loop.statistics import LEAST_T, focused_folds
 from magtensor.registry import Registry

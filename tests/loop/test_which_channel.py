@@ -66,3 +66,13 @@ def test_what_follows_no_channel_stays_as_it_is(record: Record) -> None:
     state = linear_state(record)
     drift = candidate(Registry.load().find("error_model", "offset_drift"), {}, state, 30, ALPHA)
     assert nearest(drift, state, 30) == (drift, ())
+
+
+def test_channels_are_compared_beside_one_fit(record: Record) -> None:
+    """The candidate was judged at a fit of its own, which leaves half of what the common one does."""
+    state = beside(record, record.logged["temperature"].mean(axis=1))
+    left = state.residual
+    assert left.across is not None and left.along is not None
+    half = replace(state, residual=replace(left, across=0.5 * left.across, along=0.5 * left.along))
+    chosen, others = nearest(replace(following("temperature", state), before=half), state, 30)
+    assert chosen.model.settings["channel"] == "temperature" and others == ("temperature_air",)

@@ -13,7 +13,8 @@ from magtensor.loop.beginnings import beginning, extent, least_gain, with_beginn
 from magtensor.loop.contribution import KEEP_ALPHA, held_out, put_back, significance, slices
 from magtensor.loop.gates import Candidate
 from magtensor.loop.golden import golden
-from magtensor.loop.model import Adopted, Fitting, Record, State, joint_state
+from magtensor.loop.model import Adopted, Fitting, Record, State
+from magtensor.loop.refit import joint_state
 from magtensor.loop.scoring import Scorer
 from magtensor.loop.separation import SEPARATION
 from magtensor.loop.settings import Forms, Frequencies, Range, profiled

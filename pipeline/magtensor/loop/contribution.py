@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from magtensor.calibration.types import Array
 from magtensor.loop.assessment import WHITE, Colours, block_count, estimated_in, explained
 from magtensor.loop.evidence import Grams, Whitened, grams
-from magtensor.loop.model import Adopted, Fitting, Record, State, joint_state
+from magtensor.loop.model import Adopted, Fitting, Record, State
 from magtensor.loop.own_noise import OwnNoise
+from magtensor.loop.refit import joint_state
 from magtensor.loop.residual import Residual, taken_off
 from magtensor.loop.settings import EventTimes, Frequencies, profiled
 from magtensor.loop.statistics import Gain, concentrated, family_p, focused_gain, held_out_gain

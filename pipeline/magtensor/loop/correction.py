@@ -12,7 +12,8 @@ from magtensor.calibration.by_sensor import by_sensor
 from magtensor.calibration.types import Array, ArrayCalibration
 from magtensor.loop.another_survey import as_begun_here
 from magtensor.loop.delays import cleared, lateness, on_time, unseen
-from magtensor.loop.model import Adopted, Record, State, without
+from magtensor.loop.model import Adopted, Record, State
+from magtensor.loop.refit import without
 from magtensor.loop.terms import Terms
 from magtensor.loop.waveform import NAME, bends, course_of
 from magtensor.tensor.geometry import array_design

@@ -14,7 +14,8 @@ from magtensor.calibration.joint import nearest_frame
 from magtensor.calibration.types import Array
 from magtensor.errors import DataError, NotEnoughData
 from magtensor.loop.log_noise import channels_of
-from magtensor.loop.model import Adopted, Fitting, Record, State, joint_state, without
+from magtensor.loop.model import Adopted, Fitting, Record, State
+from magtensor.loop.refit import joint_state, without
 from magtensor.loop.terms import Terms
 from magtensor.sharing import shared_out
 from magtensor.tensor.assembly import least_squares_assembly

@@ -7,8 +7,9 @@ from dataclasses import replace
 import numpy as np
 
 from magtensor.calibration.types import Mask
-from magtensor.loop.model import Record, State, without
+from magtensor.loop.model import Record, State
 from magtensor.loop.own_noise import OwnNoise
+from magtensor.loop.refit import without
 from magtensor.loop.residual import residual_of
 
 LONGEST_SPIKE = 2  # samples: what lasts longer is no accident of the recording

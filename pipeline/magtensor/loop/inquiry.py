@@ -20,12 +20,13 @@ from magtensor.loop.found import Search, Step
 from magtensor.loop.gates import Candidate
 from magtensor.loop.latent import NAME, sought
 from magtensor.loop.long_record import on_every_sample, part_of
-from magtensor.loop.model import Adopted, Fitting, Record, State, joint_state, without
+from magtensor.loop.model import Adopted, Fitting, Record, State
 from magtensor.loop.needs import missing
 from magtensor.loop.outcome import described
 from magtensor.loop.own_fit import at_their_own_fit
 from magtensor.loop.profiling import repeatable
 from magtensor.loop.record import record_of
+from magtensor.loop.refit import joint_state, without
 from magtensor.loop.rounds import with_lines
 from magtensor.loop.screening import candidates_of
 from magtensor.loop.search import search

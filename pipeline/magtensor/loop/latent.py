@@ -25,7 +25,8 @@ from magtensor.loop.factor import Factors, Groups, noise_alone, refitted, with_f
 from magtensor.loop.gates import OF_THE_LAW, Candidate, explained_before, gained_of_a_log
 from magtensor.loop.likeness import effect_along, followed
 from magtensor.loop.log_noise import brought_in
-from magtensor.loop.model import Adopted, Fitting, Record, State, joint_state
+from magtensor.loop.model import Adopted, Fitting, Record, State
+from magtensor.loop.refit import joint_state
 from magtensor.loop.residual import Residual
 from magtensor.loop.statistics import FOLDS, Gain
 from magtensor.loop.terms import joined

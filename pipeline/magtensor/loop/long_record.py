@@ -15,7 +15,8 @@ import numpy as np
 from magtensor.calibration.joint import JointFit
 from magtensor.loop.found import Search
 from magtensor.loop.latent import renewed
-from magtensor.loop.model import Adopted, Fitting, Record, joint_state
+from magtensor.loop.model import Adopted, Fitting, Record
+from magtensor.loop.refit import joint_state
 from magtensor.loop.spectrum import spectral_lines
 from magtensor.loop.wandering import unweighed
 

@@ -11,7 +11,8 @@ from magtensor.calibration.undetermined import Undetermined, undetermined
 from magtensor.errors import DataError
 from magtensor.loop.found import Search
 from magtensor.loop.inquiry import Inquiry
-from magtensor.loop.model import Fitting, require_determined
+from magtensor.loop.model import Fitting
+from magtensor.loop.refit import require_determined
 
 Inquire = Callable[[Fitting], Inquiry]
 

@@ -17,7 +17,8 @@ from magtensor.loop.assessment import Assessment, assess, colours_of
 from magtensor.loop.contribution import happens_once, put_back, slices
 from magtensor.loop.evidence import Whitened
 from magtensor.loop.gates import Candidate
-from magtensor.loop.model import Fitting, Record, State, joint_state
+from magtensor.loop.model import Fitting, Record, State
+from magtensor.loop.refit import joint_state
 from magtensor.loop.separation import fold_gain, lower_orders, separated
 from magtensor.loop.settings import profiled
 from magtensor.loop.terms import Terms

@@ -19,9 +19,10 @@ from magtensor.loop.excitation import Excitation
 from magtensor.loop.found import Search, Step
 from magtensor.loop.gates import ALPHA
 from magtensor.loop.latent import NAME, SINGLE_STRETCH, renewed, sought
-from magtensor.loop.model import Adopted, Fitting, Record, State, joint_state, of_the_site
+from magtensor.loop.model import Adopted, Fitting, Record, State, of_the_site
 from magtensor.loop.needs import missing
 from magtensor.loop.overshadowed import overshadowed
+from magtensor.loop.refit import joint_state
 from magtensor.loop.rounds import Ended, Rounds, with_lines
 from magtensor.loop.trial import on_the_folds_of, trial
 from magtensor.loop.wandering import all_noise, narrowed_to, of_sensors, quieter, unweighed

@@ -1,6 +1,6 @@
 """Declared error models beside C and o of one survey or several, with what is known of the field.
 
-As `model.joint_state`, which the search uses: for given coefficients C, o and the unknown constants of the field are
+As `refit.joint_state`, which the search uses: for given coefficients C, o and the unknown constants of the field are
 the fit of outputs and total field with the effects taken off (`calibration.surveys`); the coefficients then move by a
 step in which all of these are free. Coefficients are common to all surveys, whose residuals, put after each other, are
 one series: its noise has one colour, whose slow part follows from its middle frequencies, as what the coefficients took
@@ -26,8 +26,10 @@ from magtensor.errors import DataError, NotEnoughData
 from magtensor.loop.assessment import Colours, colours_of, estimated
 from magtensor.loop.delays import cleared
 from magtensor.loop.excitation import Excitation
-from magtensor.loop.model import MOST_ROUNDS, SETTLED, Adopted, Record, beside_the_site, share_of
+from magtensor.loop.model import Adopted, Record
+from magtensor.loop.refit import MOST_ROUNDS, SETTLED, share_of
 from magtensor.loop.residual import Levels, Residual, Sighted
+from magtensor.loop.seen import beside_the_site
 from magtensor.loop.statistics import Estimate
 from magtensor.loop.stretches import borne_out_in
 from magtensor.loop.terms import REFERENCE, Terms, joined, stacked

@@ -16,8 +16,9 @@ import numpy as np
 
 from magtensor.calibration.types import Array
 from magtensor.loop.excitation import VECTORS
-from magtensor.loop.model import Adopted, Fitting, Record, State, reweighed
+from magtensor.loop.model import Adopted, Fitting, Record, State
 from magtensor.loop.own_noise import OwnNoise
+from magtensor.loop.refit import reweighed
 
 UNEQUAL = 3.0  # all of a sensor's noise over its white noise, beside the same of the sensor that wanders least
 LEAST_SENSORS = 3  # two have one contrast, which does not tell whose effect it is
