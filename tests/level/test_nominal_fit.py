@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from level_cases import TOTAL, flight
 
+from magtensor.calibration import nominal as nominal_module
 from magtensor.calibration.joint import calibrated, fit_joint, nearest_frame
 from magtensor.calibration.nominal import Nominal, _Data, fit_nominal
+from magtensor.calibration.types import Array
 from magtensor.errors import DataError, NotEnoughData
 from magtensor.loop.residual import residual_of
 
@@ -18,15 +22,56 @@ def test_scores_vanish_at_the_truth_and_change_as_they_say(sensors: int) -> None
     data = _Data(flown.raw.reshape(300, -1), np.full(300, TOTAL), TOTAL, np.linspace(5.0, 9.0, 3 * sensors), 3.0)
     true = np.concatenate([flown.forward, flown.offset[:, :, None] / TOTAL], axis=2).reshape(-1, 4)
     weights = (0.7, 0.3)
-    score, change, covariance = data.equations(data.at(true), weights)
+    basis = data.basis(data.at(true))
+    score, change, covariance = data.equations(data.at(true), weights, basis)
     size = np.sqrt(np.diag(covariance))
     assert np.max(np.abs(score) / size) < 1e-3
     assert np.linalg.eigvalsh(covariance / np.outer(size, size))[0] > -1e-9
     rng = np.random.default_rng(2)
     for way in rng.standard_normal((5, 3 * sensors, 4)):
-        there, back = (data.equations(data.at(true + step * way), weights)[0] for step in (1e-6, -1e-6))
-        expected = -change @ way.ravel()
+        there, back = (data.equations(data.at(true + step * way), weights, basis)[0] for step in (1e-6, -1e-6))
+        expected = -change @ (way @ basis.T).ravel()
         assert np.max(np.abs((there - back) / 2e-6 - expected)) < 1e-3 * np.max(np.abs(expected))
+
+
+def _observatory(seed: int) -> tuple[Array, Array]:
+    """Outputs (5000, 2, 3) nT of nearly perfect sensors that never turn in a field that hardly changes in a day, and
+    the total field (5000,) nT."""
+    rng = np.random.default_rng(seed)
+    day = np.linspace(0, 2 * np.pi, 5000)
+    field = np.array([21e3, 1.5e3, 43.5e3]) + 15.0 * np.column_stack([np.sin(day), np.cos(2 * day), np.sin(3 * day)])
+    forward = np.eye(3) + 1e-4 * rng.standard_normal((2, 3, 3))
+    raw = np.einsum("sij,nj->nsi", forward, field) + 0.01 * rng.standard_normal((5000, 2, 3))
+    return raw, np.linalg.norm(field, axis=1)
+
+
+def test_sensors_that_stand_still_are_fitted_in_a_few_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What samples know of some parameters is 1e14 times what the prior does; rounding has to be less than that."""
+    counted: list[int] = []
+    equations, settled = _Data.equations, nominal_module._settled
+
+    def counting(*args: Any) -> Any:
+        counted[-1] += 1
+        return equations(*args)
+
+    def each(*args: Any) -> Any:
+        counted.append(0)
+        return settled(*args)
+
+    monkeypatch.setattr(_Data, "equations", counting)
+    monkeypatch.setattr(nominal_module, "_settled", each)
+    fit_nominal(*_observatory(8), Nominal())
+    assert max(counted) <= 12, "as many as a quadratic problem takes, and not until rounding happens to be small"
+
+
+def test_a_fit_that_begins_with_another_ends_where_it_does_without() -> None:
+    raw, total_field = _observatory(9)
+    before = fit_nominal(raw, total_field, Nominal())
+    changed = raw + np.array([3.0, -2.0, 1.0])
+    cold, warm = (fit_nominal(changed, total_field, Nominal(), start=start) for start in (None, before))
+    assert cold.posterior is not None
+    off = np.concatenate([(warm.forward - cold.forward).reshape(2, 9), warm.offset - cold.offset], axis=1).ravel()
+    assert np.max(np.abs(off) / np.sqrt(np.diag(cold.posterior.covariance))) < 0.02
 
 
 def test_a_survey_that_determines_it_is_fitted_alike_with_and_without_the_prior() -> None:

@@ -43,6 +43,7 @@ ROUNDING = 1e-13
 LARGEST = 100.0  # of F: of outputs that an effect which ran away has been taken off
 _ROUNDS = 8
 _STEPS = 40
+_FARTHEST_STEP = 1.0  # standard deviations of the prior
 
 
 @dataclass(frozen=True)
@@ -118,16 +119,28 @@ class _Data:
         across = plane.residual(self.x)
         return _Here(rows, plane, matrix, offset, field, seen.unit.T, across, seen.residual, seen.inverse_std)
 
-    def equations(self, here: _Here, weights: tuple[float, float]) -> tuple[Array, Array, Array]:
-        """Scores (12 S,), their change with the parameters (12 S, 12 S), and their covariance.
+    def basis(self, here: _Here) -> Array:
+        """(4, 4) T: the parameters of an output times T belong to series that have nothing in common.
+
+        A field that hardly turns is nearly a constant, and of products of the two rounding leaves little.
+        """
+        return np.asarray(np.linalg.qr(self._seen(here), mode="r") / np.sqrt(len(here.field)))
+
+    def _seen(self, here: _Here) -> Array:
+        """(N, 4): the field, and what an offset is multiplied by."""
+        return np.column_stack([here.field / self.unit, np.ones(len(here.field))])
+
+    def equations(self, here: _Here, weights: tuple[float, float], basis: Array) -> tuple[Array, Array, Array]:
+        """Scores (12 S,), their change with the parameters in a basis (12 S, 12 S), and their covariance.
 
         A residual times what the field of the neighbouring samples would make it: their noise is not in the residual.
         """
         across, inside = weights
-        z = np.column_stack([here.field / self.unit, np.ones(len(here.field))])
+        apart = np.linalg.inv(basis)
+        z = self._seen(here) @ apart
         towards = _neighbours(here.field)
         towards /= np.linalg.norm(towards, axis=1, keepdims=True)
-        other = np.column_stack([towards * (self.total_field / self.unit)[:, None], np.ones(len(z))])
+        other = np.column_stack([towards * (self.total_field / self.unit)[:, None], np.ones(len(z))]) @ apart
         scale = self.unit / self.noise
         off = (np.eye(len(scale)) - here.plane.basis @ here.plane.basis.T) * np.outer(scale, scale)
         score = across * ((here.across * scale).T @ other).ravel()
@@ -158,6 +171,7 @@ def fit_nominal(
     keep: Mask | None = None,
     complete: bool = True,
     quiet_field: Array | None = None,
+    start: JointFit | None = None,
 ) -> JointFit:
     """Fit C and o of all sensors to their outputs and the total field, beside what is known of them beforehand.
 
@@ -169,6 +183,7 @@ def fit_nominal(
     noise, reference_noise, worst_error, keep, complete: as in `joint.fit_recording`. A complete model is also held
         against the prior.
     quiet_field: (N,) nT, the total field without the reference's own noise; the total field itself when None.
+    start: a fit of nearly the same outputs, to begin with; sensors at nominal when None.
 
     Raises
     ------
@@ -196,6 +211,8 @@ def fit_nominal(
     unit = float(np.mean(total_field[believed]))
     std = nominal.std(sensors)
     rows = np.tile(np.eye(3, 4), (sensors, 1))
+    if start is not None:
+        rows = np.column_stack([start.forward.reshape(-1, 3), start.offset.ravel() / unit])
     own = _noise(rows, flat, total_field, unit, believed) if noise is None else np.asarray(noise).ravel()
     here, covariance, weights = None, np.zeros(0), (0.0, 0.0)
     for round_ in range(_ROUNDS):
@@ -290,21 +307,27 @@ def _settled(data: _Data, rows: Array, weights: tuple[float, float], std: Array)
     nominal = np.tile(np.eye(3, 4), (len(rows) // 3, 1))
     here = data.at(rows)
     for _ in range(_STEPS):
-        score, change, covariance = data.equations(here, weights)
+        basis = data.basis(here)
+        into = np.kron(np.eye(len(rows)), basis) * std
+        score, change, covariance = data.equations(here, weights, basis)
         away = (here.rows - nominal).ravel() / std
         root = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
         values, vectors = np.linalg.eigh(covariance / np.outer(root, root))
-        whiten = vectors.T / np.sqrt(np.maximum(values, ROUNDING * values[-1]))[:, None] / root
-        shown = whiten @ (change * std)
-        said = whiten @ score + shown @ away
-        known = shown.T @ shown + np.eye(len(root))
-        moved = np.linalg.solve(known, shown.T @ said)
-        if not np.isfinite(moved).all():
+        real = values > ROUNDING * values[-1]
+        whiten = vectors.T[real] / np.sqrt(values[real])[:, None] / root
+        # no products of these: what the samples know beside the prior differs by fourteen orders of magnitude
+        shown = np.vstack([whiten @ change @ into, np.eye(len(root))])
+        said = np.concatenate([whiten @ score, -away])
+        if not (np.isfinite(shown).all() and np.isfinite(said).all()):
             raise NotEnoughData("the fit near nominal does not converge", hint="look for disturbed samples")
-        here = data.at(nominal + (moved * std).reshape(rows.shape))
-        if np.sum((moved - away) * (known @ (moved - away))) < 1e-4:  # a hundredth of a standard deviation
+        left, known, right = np.linalg.svd(shown, full_matrices=False)
+        moved = left.T @ said / known
+        moved /= max(1.0, float(np.max(np.abs(right.T @ moved))) / _FARTHEST_STEP)
+        here = data.at(nominal + ((away + right.T @ moved) * std).reshape(rows.shape))
+        if np.sum((known * moved) ** 2) < 1e-4:  # a hundredth of a standard deviation
             break
-    return here, np.asarray(np.linalg.inv(known) * np.outer(std, std))
+    root_covariance = std[:, None] * right.T / known
+    return here, np.asarray(root_covariance @ root_covariance.T)
 
 
 def _believed(data: _Data, here: _Here, raw: Array, total_field: Array, reference_noise: float, before: Mask) -> Mask:

@@ -56,10 +56,11 @@ def joint_state(
     raw, reference = record.raw, record.total_field
     estimate: Estimate | None = None
     terms: Terms | None = None
-    known: Coverage | None = None
+    fit: JointFit | None = None
     for round_ in range(MOST_ROUNDS):
-        fit = _fit(record, raw, reference, how, keep, known if round_ + 1 < MOST_ROUNDS else None)
-        known = fit.coverage  # between the first fit and the last nobody asks
+        # what attitudes can determine nobody asks between the first fit and the last
+        known = None if fit is None or round_ + 1 == MOST_ROUNDS else fit.coverage
+        fit = _fit(record, raw, reference, how, keep, known, fit)
         x = beside_the_site(excitation_of(record, fit, raw, lines), adopted, theta)
         if not adopted:
             break
@@ -68,7 +69,7 @@ def joint_state(
             theta = [t if len(t) == e.count else np.zeros(e.count) for t, e in zip(theta, each, strict=True)]
             if any(t.any() for t in theta):
                 raw, reference = without(record, each, theta)
-                fit = _fit(record, raw, reference, how, keep)
+                fit = _fit(record, raw, reference, how, keep, start=fit)
                 x = beside_the_site(excitation_of(record, fit, raw, lines), adopted, theta)
                 each = [a.terms(x) for a in adopted]
         residual = quick(residual_of(fit, raw, reference, how.reference_noise))
@@ -84,7 +85,7 @@ def joint_state(
         raw, reference = without(record, each, theta)
         step = np.abs(after - before) / np.sqrt(np.maximum(np.diag(estimate.covariance), 1e-300))
         if np.max(step, initial=0.0) < SETTLED:
-            fit = _fit(record, raw, reference, how, keep)
+            fit = _fit(record, raw, reference, how, keep, start=fit)
             x = beside_the_site(excitation_of(record, fit, raw, lines), adopted, theta)
             break
     if estimate is not None:
@@ -92,8 +93,9 @@ def joint_state(
         if not np.array_equal(shown, np.concatenate(theta)):
             theta = np.split(shown, edges)
             raw, reference = without(record, each, theta)
-            fit = _fit(record, raw, reference, how, keep)
+            fit = _fit(record, raw, reference, how, keep, start=fit)
             x = beside_the_site(excitation_of(record, fit, raw, lines), adopted, theta)
+    assert fit is not None
     return _state(record, adopted, theta, fit, raw, reference, how, x, estimate, lines)
 
 
@@ -157,6 +159,7 @@ def _fit(
     how: Fitting,
     keep: NDArray[np.bool_] | None,
     known: Coverage | None = None,
+    start: JointFit | None = None,
 ) -> JointFit:
     assert reference is not None and record.total_field is not None and record.quiet_field is not None
     loud = record.total_field - record.quiet_field
@@ -168,7 +171,7 @@ def _fit(
         }  # fmt: skip
         if how.nominal is None:
             return fit_joint(raw, reference, known=known, **options)
-        return fit_nominal(raw, reference, how.nominal, quiet_field=reference - loud, **options)
+        return fit_nominal(raw, reference, how.nominal, quiet_field=reference - loud, start=start, **options)
 
     try:
         fit = fitted(keep)
