@@ -142,7 +142,10 @@ def _disagreement(outcome: dict[str, Any]) -> str:
     if worse:
         return "; what was added makes the verification survey worse: it does not carry over"
     if apart:
-        return "; the verification survey disagrees with the calibration: look for what changed between the two"
+        return (
+            "; the verification survey disagrees with the calibration: something changed between the two, or the first "
+            "shows too little of what the second needs"
+        )
     return ""
 
 

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import h5py
+import numpy as np
 import pytest
 from loop_cases import BASE, adopted_names, loaded, scenario, verdict_of
+from scipy.signal import lfilter
 
-from magtensor.loop import search
+from magtensor.loop import rounds, search
 from magtensor.loop.found import Search
 from magtensor.loop.model import Adopted, Fitting
 from magtensor.loop.overshadowed import attitude_share
@@ -104,3 +108,53 @@ def test_a_source_that_is_taken_out_again_does_not_come_back(tmp_path: Path, mon
     assert told["adopted"] == []
     assert [s["adopted"] for s in told["steps"]] == ["latent_source", None, None]
     assert told["steps"][-1]["refused"] == {"latent_source": "it is doubted here"}
+
+
+def test_a_noisy_base_station_overshadows_nothing_that_the_sensors_show(tmp_path: Path) -> None:
+    """What stays is in |b| - F alone and does not follow the attitude: no law of the attitude, of which a
+    nonlinearity may be a part."""
+
+    def wandering(path: Path) -> None:
+        with h5py.File(path, "a") as file:
+            field = file["reference/total_field"]
+            steps = np.random.default_rng(4).standard_normal(len(field))
+            field[:] = field[:] + 2.0 * lfilter([1.0], [1.0, -0.9], steps) * np.sqrt(1.0 - 0.81)
+
+    effect = {"type": "nonlinearity_quadratic", "rms_nT": 0.25}
+    told = verdict_of(tmp_path, scenario(26, effect, motion=SHORT), wandering, MODELS)
+    assert told["unexplained"]["excess_rms_nT"] > 0.25  # more than the effect
+    assert adopted_names(told) == {"nonlinearity_quadratic"}
+    assert told["unexplained"]["present"] and "an error of the base station" in told["unexplained"]["description"]
+
+
+def test_a_base_station_whose_noise_is_all_that_is_left_is_named(tmp_path: Path) -> None:
+    """Between readings of white noise its field is no white noise, and of all sensors alike."""
+    noisy = BASE["base_station"] | {"noise_sd_nT": 1.2}
+    told = verdict_of(tmp_path, scenario(27, motion=SHORT, base_station=noisy), models=MODELS)
+    assert adopted_names(told) == set()
+    assert not told["unexplained"]["present"], told["unexplained"]["description"]
+    assert "the base station's own noise makes" in told["unexplained"]["description"]
+
+
+@pytest.mark.parametrize(("lost", "better", "kept"), [(1, 0.5, True), (1, -0.1, False), (100, 0.5, False)])
+def test_a_source_in_the_place_of_a_step_may_cost_samples_that_do_not_make_it_better(
+    lost: int, better: float, kept: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A hundred samples in a thousand that are left out may by themselves make what stays the likelier."""
+
+    def state(believed: int) -> Any:
+        return SimpleNamespace(
+            adopted=[SimpleNamespace(name="offset_while")],
+            fit=SimpleNamespace(keep=np.arange(1000) < believed),
+            residual=SimpleNamespace(affine=np.ones((believed, 4))),
+        )
+
+    before, source = state(1000), SimpleNamespace(after=state(1000 - lost))
+    monkeypatch.setattr(rounds, "without_models", lambda *_: state(1000))
+    monkeypatch.setattr(rounds, "sought", lambda *_, **__: object())
+    monkeypatch.setattr(rounds, "tried_source", lambda *_: (None, source))
+    monkeypatch.setattr(rounds, "per_sample", lambda s: better if s is source.after else 0.0)
+    left: Any = SimpleNamespace(left_by="offset_while", significant=False)
+    given: Any = None
+    found = rounds._source_instead(given, given, before, left, given, 0, 0.005)
+    assert (found is not None) == kept

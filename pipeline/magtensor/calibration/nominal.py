@@ -40,9 +40,12 @@ FARTHEST = 5.0  # standard deviations of the prior
 BLOCKS = (120, 30, 12)
 ELSEWHERE = 0.1  # of the field's variance: samples whose neighbours differ by more do not follow each other
 ROUNDING = 1e-13
+CLOSE = 0.01  # standard deviations of what is fitted: of the last step
+ASTRAY = 10.0  # the same: no step leads to a fit, as of outputs that an effect which ran away has been taken off
 LARGEST = 100.0  # of F: of outputs that an effect which ran away has been taken off
+DIVERGES, HINT = "the fit near nominal does not converge", "look for disturbed samples"
 _ROUNDS = 8
-_STEPS = 40
+_STEPS = 20
 _FARTHEST_STEP = 1.0  # standard deviations of the prior
 
 
@@ -305,7 +308,7 @@ def _settled(data: _Data, rows: Array, weights: tuple[float, float], std: Array)
     estimate, and again from there.
     """
     nominal = np.tile(np.eye(3, 4), (len(rows) // 3, 1))
-    here = data.at(rows)
+    here, size = data.at(rows), np.inf
     for _ in range(_STEPS):
         basis = data.basis(here)
         into = np.kron(np.eye(len(rows)), basis) * std
@@ -319,13 +322,16 @@ def _settled(data: _Data, rows: Array, weights: tuple[float, float], std: Array)
         shown = np.vstack([whiten @ change @ into, np.eye(len(root))])
         said = np.concatenate([whiten @ score, -away])
         if not (np.isfinite(shown).all() and np.isfinite(said).all()):
-            raise NotEnoughData("the fit near nominal does not converge", hint="look for disturbed samples")
+            raise NotEnoughData(DIVERGES, hint=HINT)
         left, known, right = np.linalg.svd(shown, full_matrices=False)
         moved = left.T @ said / known
         moved /= max(1.0, float(np.max(np.abs(right.T @ moved))) / _FARTHEST_STEP)
         here = data.at(nominal + ((away + right.T @ moved) * std).reshape(rows.shape))
-        if np.sum((known * moved) ** 2) < 1e-4:  # a hundredth of a standard deviation
+        size = float(np.linalg.norm(known * moved))
+        if size < CLOSE:
             break
+    if size > ASTRAY:
+        raise NotEnoughData(DIVERGES, hint=HINT)
     root_covariance = std[:, None] * right.T / known
     return here, np.asarray(root_covariance @ root_covariance.T)
 

@@ -198,6 +198,18 @@ def explained_share(state: State, place: int) -> float:
     return float(both / lasting) if lasting > 0 else 1.0
 
 
+def share_of_the_field(state: State, place: int) -> float:
+    """The largest share that an adopted model has of what an output does: of the field, where that is the unit of its
+    coefficients, and of the changes of the field in the survey, as standard deviations."""
+    assert state.terms is not None
+    part, theta = slices(state)[place], np.zeros(state.terms.count)
+    theta[part] = state.theta[place]
+    added = state.terms.contribution(theta, len(state.residual.noise)).std(axis=0)
+    field = state.excitation.field[state.residual.samples, 0].std(axis=0)
+    relative = [abs(c) * 1e-6 for c, u in zip(state.theta[place], state.terms.units[part], strict=True) if u == "ppm"]
+    return max([float(np.max(added) / np.linalg.norm(field)), *relative])
+
+
 def without_models(record: Record, state: State, places: Sequence[int], how: Fitting) -> State:
     """The fit without some of its models."""
     rest = [i for i in range(len(state.adopted)) if i not in places]

@@ -21,6 +21,7 @@ from magtensor.loop.contribution import happens_once, removal, slices
 from magtensor.loop.direction import attitude_series, turning_Hz
 from magtensor.loop.found import Search
 from magtensor.loop.model import Adopted, State
+from magtensor.loop.predictable import enough_for_the_total_field, predictable_in_the_total_field
 from magtensor.loop.residual import taken_off
 from magtensor.loop.settings import Frequencies, profiled
 from magtensor.loop.terms import joined
@@ -156,9 +157,10 @@ def _part_of_a_source(found: Search, fixed: int) -> tuple[list[int], str] | None
 
 def staying(found: Search) -> float:
     """nT rms above the white noise that stays and may follow the attitude: without what the best of the significant
-    effects of something else would explain that a gate refused, as one that happened once and predicts nothing."""
+    effects of something else would explain that a gate refused, as one that happened once and predicts nothing, or
+    without what of |b| - F does not follow it, as where the base station is noisy."""
     state, residual = found.told, found.told.residual
-    other = 0.0
+    other = _of_the_reference(state)
     for candidate in found.steps[-1].candidates if found.steps else ():
         if max(candidate.adjusted_p, candidate.adjusted_null_p) >= candidate.alpha:
             continue
@@ -170,6 +172,16 @@ def staying(found: Search) -> float:
         if explained > other and attitude_part(state, own) <= MOSTLY:
             other = explained
     return float(np.sqrt(max(residual.square() - 1.0 - other, 0.0)) * residual.scale)
+
+
+def _of_the_reference(state: State) -> float:
+    """Mean square, of the whole whitened residual, that |b| - F adds to its white noise and that the attitude does not
+    predict; 0 where there are too few samples to ask."""
+    residual = state.residual
+    if residual.across is None or residual.along is None or not enough_for_the_total_field(state):
+        return 0.0
+    beyond = float(np.mean(residual.along**2) - 1.0) / residual.freedom
+    return max(beyond - predictable_in_the_total_field(state) ** 2, 0.0)
 
 
 def attitude_share(state: State, places: Sequence[int]) -> float:

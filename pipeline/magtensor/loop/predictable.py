@@ -53,11 +53,16 @@ def predictable_in_the_total_field(state: State) -> float:
     The same for what no sensor feels alone: polynomials of the direction, and of attitudes and accelerations where they
     are logged, added to the reference.
     """
-    series = attitude_series(state.excitation)
-    if state.residual.along is None or len(state.residual.affine) < LEAST_FOR_DIRECTION * series.shape[1]:
+    if state.residual.along is None or not enough_for_the_total_field(state):
         return 0.0
+    series = attitude_series(state.excitation)
     each = [state.excitation.on_reference(column, "nT", str(number)) for number, column in enumerate(series.T)]
     return _predictable(state, joined(each))
+
+
+def enough_for_the_total_field(state: State) -> bool:
+    """Whether there are samples enough to ask what of the total field the attitude predicts."""
+    return len(state.residual.affine) >= LEAST_FOR_DIRECTION * attitude_series(state.excitation).shape[1]
 
 
 def converter_words(state: State) -> list[str]:

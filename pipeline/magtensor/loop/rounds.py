@@ -9,7 +9,14 @@ from magtensor.components import Component
 from magtensor.errors import DataError
 from magtensor.loop.adopting import adopt, narrowed, polished
 from magtensor.loop.changing_matrix import channel_instead
-from magtensor.loop.contribution import agrees, eliminate, happens_once, of_all_alike, without_models
+from magtensor.loop.contribution import (
+    agrees,
+    eliminate,
+    happens_once,
+    of_all_alike,
+    share_of_the_field,
+    without_models,
+)
 from magtensor.loop.exchange import looked_at_again, simpler
 from magtensor.loop.excitation import Excitation
 from magtensor.loop.found import Step
@@ -18,6 +25,7 @@ from magtensor.loop.latent import NAME, Sought, Source, renewed, sought, tried_s
 from magtensor.loop.log_noise import channels_of
 from magtensor.loop.model import Fitting, Record, State, generic
 from magtensor.loop.needs import missing
+from magtensor.loop.overshadowed import MOSTLY, attitude_share
 from magtensor.loop.own_fit import at_their_own_fit
 from magtensor.loop.profiling import already, repeatable
 from magtensor.loop.rivals import containing, hardly_begun, part_of, part_of_a_drift, simplest
@@ -26,6 +34,7 @@ from magtensor.loop.spectrum import spectral_lines
 from magtensor.loop.trial import Trial, on_the_folds_of, per_sample, trial
 from magtensor.loop.which_channel import nearest
 
+MOST_OF_A_SAMPLE = 50.0  # log likelihood: half of the largest squared residual of a sample that noise may explain
 ROUNDING = 1e-4  # mean square of the whitened residual: far below the least noise that any sensor is believed to have
 
 
@@ -177,9 +186,10 @@ def _source_instead(
     tried = left.significant and all(generic(state.adopted[i]) for i in places)
     shared = sought(less, record, may_follow=tried)
     source = None if shared is None else tried_source(component, record, less, shared, how, alpha)[1]
-    if source is None or source.after.fit.keep.sum() < state.fit.keep.sum():
+    if source is None:
         return None
-    return source if per_sample(source.after) > per_sample(state) else None
+    lost = max(int(state.fit.keep.sum() - source.after.fit.keep.sum()), 0) / len(state.residual.affine)
+    return source if per_sample(source.after) > per_sample(state) + MOST_OF_A_SAMPLE * lost else None
 
 
 @dataclass(frozen=True)
@@ -267,6 +277,10 @@ def _kept(record: Record, before: Trial, chosen: Candidate, how: Fitting) -> tup
         return None, f"fitted, all sensors show it alike: an error of the base station that {drift} would look the same"
     if not agrees(after.state, which):
         return None, "fitted, its coefficients are not what its settings assume"
+    if how.nominal is not None and attitude_share(after.state, [which]) > MOSTLY:
+        share = share_of_the_field(after.state, which)
+        if share > how.nominal.scale:  # what C takes back of it keeps it from being seen
+            return None, f"fitted, it makes {share:.0%} of what an output does: more than is assumed of a sensor"
     if not before.likelier(after):
         return None, "fitted together with the others, it leaves more than it takes away"
     if happens_once(model):

@@ -47,8 +47,10 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
         seen = [c for c in seen if _still_significant(c, state)]
     suspects = [c for c in seen if not (c.of_the_log or c.of_second_order or c.of_the_law)]
     words: list[str] = []
-    if found.shared is not None and found.shared.significant:
-        words.append(shared_words(found.shared, record.sensors))
+    shared = found.shared
+    # noise that grows louder makes a small one by chance, which predicts nothing
+    if shared is not None and shared.significant and (shared.gain.consistent or shared.share > OF_A_LINE):
+        words.append(shared_words(shared, record.sensors))
     line = strongest_line(state, record)
     # where the platform turns steadily, what is no tone has a small line too
     if line is not None and line[1] ** 2 >= OF_A_LINE * excess**2:
@@ -58,8 +60,11 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
     words.extend(shortened_words(state))
     words.extend(jitter_words(state))
     words.extend(one.words for one in changing_matrices(state, ALPHA))
-    of_sensors = OwnNoise(state.residual, None).slow_along()
-    if (slow := slow_along(state)) > max(MUCH * state.residual.scale, TWICE * of_sensors):
+    slow, noise = (
+        slow_along(state),
+        np.hypot(OwnNoise(state.residual, None).slow_along(), of_the_station(state, record)),
+    )
+    if slow > max(MUCH * state.residual.scale, TWICE * noise):
         words.append(
             f"{slow:.3g} nT rms of |b| - F, in all sensors alike, is no white noise: an error of the base station, or "
             "a field at the site that it does not see"
@@ -90,7 +95,7 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
     return {
         "present": present,
         "excess_rms_nT": excess,
-        "description": "; ".join([*(words if present else noise_words(state)), *beside]),
+        "description": "; ".join([*(words if present else noise_words(state, record)), *beside]),
         "looks_like": untested + _looks_like(last) if present else [],
     }
 
@@ -100,7 +105,7 @@ def unlikely(candidate: Candidate) -> bool:
     return max(candidate.adjusted_p, candidate.adjusted_own_p) < candidate.alpha and candidate.adjusted_null_p < ALPHA
 
 
-def noise_words(state: State) -> list[str]:
+def noise_words(state: State, record: Record) -> list[str]:
     """What is left where nothing is unexplained, and what of it is not white where that is more than what is."""
     residual, white, words = state.residual, state.residual.scale, [NOISE]
     if residual.across is not None:
@@ -109,8 +114,18 @@ def noise_words(state: State) -> list[str]:
         if slow > white:
             words.append(f"{slow:.3g} nT rms is not white, {_on_sensors(state)}")
     if (slow := slow_along(state)) > white:
-        words.append(f"{slow:.3g} nT rms of |b| - F is not white")
+        station = of_the_station(state, record)
+        theirs = f": the base station's own noise makes {station:.2g} nT of it" if 2.0 * station > slow else ""
+        words.append(f"{slow:.3g} nT rms of |b| - F is not white{theirs}")
     return words
+
+
+def of_the_station(state: State, record: Record) -> float:
+    """nT rms of the total field that the base station's own white noise makes between its readings; 0 without one."""
+    if record.total_field is None or record.quiet_field is None:
+        return 0.0
+    loud = (record.total_field - record.quiet_field)[state.residual.samples]
+    return float(np.sqrt(np.mean((loud - loud.mean()) ** 2)))
 
 
 def slow_along(state: State) -> float:
