@@ -217,12 +217,12 @@ def fit_nominal(
     if start is not None:
         rows = np.column_stack([start.forward.reshape(-1, 3), start.offset.ravel() / unit])
     own = _noise(rows, flat, total_field, unit, believed) if noise is None else np.asarray(noise).ravel()
-    here, covariance, weights = None, np.zeros(0), (0.0, 0.0)
+    here, covariance, weights, step = None, np.zeros(0), (0.0, 0.0), 0.0
     for round_ in range(_ROUNDS):
         data = _Data(flat[believed], total_field[believed], unit, own, reference_noise)
         before = weights
         weights = _weights(data, data.at(rows))
-        here, covariance = _settled(data, rows, weights, std)
+        here, covariance, step = _settled(data, rows, weights, std)
         rows = here.rows
         settled = round_ > 0 and all(abs(np.log(a / b)) < 0.05 for a, b in zip(weights, before, strict=True))
         if keep is None:
@@ -236,6 +236,8 @@ def fit_nominal(
         if settled:
             break
     assert here is not None
+    if step > ASTRAY:
+        raise NotEnoughData(DIVERGES, hint=HINT)
     y = here.plane.coordinates(raw)
     seen = along(here.matrix, here.offset, y.T, total_field if quiet_field is None else quiet_field, 0.0)
     # the foot point in the metric of the noise: what is left of the noise in it has nothing in common with |b| - F
@@ -301,8 +303,9 @@ def _long_run(series: Array) -> float:
     return worst
 
 
-def _settled(data: _Data, rows: Array, weights: tuple[float, float], std: Array) -> tuple[_Here, Array]:
-    """The parameters most probable for given weights, and their covariance (12 S, 12 S).
+def _settled(data: _Data, rows: Array, weights: tuple[float, float], std: Array) -> tuple[_Here, Array, float]:
+    """The parameters most probable for given weights, their covariance (12 S, 12 S), and the last step in its standard
+    deviations.
 
     The scores are a linear function of the parameters with noise of known covariance: beside the prior the best linear
     estimate, and again from there.
@@ -330,10 +333,8 @@ def _settled(data: _Data, rows: Array, weights: tuple[float, float], std: Array)
         size = float(np.linalg.norm(known * moved))
         if size < CLOSE:
             break
-    if size > ASTRAY:
-        raise NotEnoughData(DIVERGES, hint=HINT)
     root_covariance = std[:, None] * right.T / known
-    return here, np.asarray(root_covariance @ root_covariance.T)
+    return here, np.asarray(root_covariance @ root_covariance.T), size
 
 
 def _believed(data: _Data, here: _Here, raw: Array, total_field: Array, reference_noise: float, before: Mask) -> Mask:

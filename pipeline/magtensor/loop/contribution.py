@@ -199,15 +199,10 @@ def explained_share(state: State, place: int) -> float:
 
 
 def share_of_the_field(state: State, place: int) -> float:
-    """The largest share that an adopted model has of what an output does: of the field, where that is the unit of its
-    coefficients, and of the changes of the field in the survey, as standard deviations."""
+    """The largest coefficient of an adopted model that is a share of the field; 0 of a model in other units."""
     assert state.terms is not None
-    part, theta = slices(state)[place], np.zeros(state.terms.count)
-    theta[part] = state.theta[place]
-    added = state.terms.contribution(theta, len(state.residual.noise)).std(axis=0)
-    field = state.excitation.field[state.residual.samples, 0].std(axis=0)
-    relative = [abs(c) * 1e-6 for c, u in zip(state.theta[place], state.terms.units[part], strict=True) if u == "ppm"]
-    return max([float(np.max(added) / np.linalg.norm(field)), *relative])
+    units = state.terms.units[slices(state)[place]]
+    return max((abs(c) * 1e-6 for c, u in zip(state.theta[place], units, strict=True) if u == "ppm"), default=0.0)
 
 
 def without_models(record: Record, state: State, places: Sequence[int], how: Fitting) -> State:

@@ -25,7 +25,6 @@ from magtensor.loop.latent import NAME, Sought, Source, renewed, sought, tried_s
 from magtensor.loop.log_noise import channels_of
 from magtensor.loop.model import Fitting, Record, State, generic
 from magtensor.loop.needs import missing
-from magtensor.loop.overshadowed import MOSTLY, attitude_share
 from magtensor.loop.own_fit import at_their_own_fit
 from magtensor.loop.profiling import already, repeatable
 from magtensor.loop.rivals import containing, hardly_begun, part_of, part_of_a_drift, simplest
@@ -277,10 +276,9 @@ def _kept(record: Record, before: Trial, chosen: Candidate, how: Fitting) -> tup
         return None, f"fitted, all sensors show it alike: an error of the base station that {drift} would look the same"
     if not agrees(after.state, which):
         return None, "fitted, its coefficients are not what its settings assume"
-    if how.nominal is not None and attitude_share(after.state, [which]) > MOSTLY:
-        share = share_of_the_field(after.state, which)
-        if share > how.nominal.scale:  # what C takes back of it keeps it from being seen
-            return None, f"fitted, it makes {share:.0%} of what an output does: more than is assumed of a sensor"
+    if how.nominal is not None and (share := share_of_the_field(after.state, which)) > how.nominal.scale:
+        # what C takes back of it keeps it from being seen
+        return None, f"fitted, it makes {share:.0%} of the field: more than is assumed of a sensor"
     if not before.likelier(after):
         return None, "fitted together with the others, it leaves more than it takes away"
     if happens_once(model):
