@@ -7,9 +7,9 @@ nothing else declared or left out. No number was set on them, but what the ballo
 (the noise of rates of change, parts of what failed, events that a drift predicts), of which its rows are no test. Parts
 of a recording should tell the same: what one of them adopts and no other bears out is either weak there or an
 accusation. The recordings are not part of the project (docs/measured/README.md). Parts that are not in the table were
-not waited for. The fit with sensors near nominal changed at 7d804bd: since then the parts of Boulder, whose fits used to
-end anywhere (held-out errors of thousands of nT), are refused. Of the others near nominal only the first two parts of
-the quadcopter were made again since.
+not waited for. The fit with sensors near nominal has changed: the parts of Boulder, whose fits used to end anywhere
+(held-out errors of thousands of nT), are refused since. Of the others near nominal only the first two parts of the
+quadcopter were made again.
 """
 
 from __future__ import annotations
