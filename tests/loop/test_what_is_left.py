@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 from loop_cases import Array, linear_state, synthetic
 
+from magtensor.loop.latent import Sought
 from magtensor.loop.model import Fitting
 from magtensor.loop.predictable import predictable_in_the_total_field
 from magtensor.loop.search import search
+from magtensor.loop.statistics import Gain
 from magtensor.loop.unexplained import NOISE, unexplained
 
 
@@ -43,3 +45,17 @@ def test_slow_noise_is_no_effect_but_its_amount_is_told() -> None:
     assert told["description"].startswith(NOISE) and "is not white, mostly on S3" in told["description"]
     quiet = synthetic(6)
     assert unexplained(search(quiet, [], Fitting()), quiet)["description"] == NOISE
+
+
+@pytest.mark.parametrize(("share", "told"), [(0.01, False), (0.5, True)])
+def test_a_small_waveform_that_predicts_nothing_is_not_told(share: float, told: bool) -> None:
+    """Noise that grows louder makes one by chance."""
+    record = synthetic(7)
+    found = search(record, [], Fitting())
+    predicts_nothing = Gain(np.ones(10), np.full(10, 2.0), np.ones(10))
+    shared = Sought(
+        time=record.time, values=np.ones(len(record.time)), std=0.1, direction=np.full((4, 3), 0.05), period_s=1.0,
+        p=1e-6, share=share, gain=predicts_nothing, like=None, switches=False, of_the_log=False, objection="small",
+    )  # fmt: skip
+    assert shared.significant and not shared.gain.consistent
+    assert unexplained(replace(found, shared=shared), record)["present"] is told

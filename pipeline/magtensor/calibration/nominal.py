@@ -236,7 +236,7 @@ def fit_nominal(
         if settled:
             break
     assert here is not None
-    if step > ASTRAY:
+    if not step <= ASTRAY:  # nor where it is no number
         raise NotEnoughData(DIVERGES, hint=HINT)
     y = here.plane.coordinates(raw)
     seen = along(here.matrix, here.offset, y.T, total_field if quiet_field is None else quiet_field, 0.0)

@@ -60,11 +60,8 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
     words.extend(shortened_words(state))
     words.extend(jitter_words(state))
     words.extend(one.words for one in changing_matrices(state, ALPHA))
-    slow, noise = (
-        slow_along(state),
-        np.hypot(OwnNoise(state.residual, None).slow_along(), of_the_station(state, record)),
-    )
-    if slow > max(MUCH * state.residual.scale, TWICE * noise):
+    noise = float(np.hypot(OwnNoise(state.residual, None).slow_along(), of_the_station(state, record)))
+    if (slow := slow_along(state)) > max(MUCH * state.residual.scale, TWICE * noise):
         words.append(
             f"{slow:.3g} nT rms of |b| - F, in all sensors alike, is no white noise: an error of the base station, or "
             "a field at the site that it does not see"
@@ -115,7 +112,7 @@ def noise_words(state: State, record: Record) -> list[str]:
             words.append(f"{slow:.3g} nT rms is not white, {_on_sensors(state)}")
     if (slow := slow_along(state)) > white:
         station = of_the_station(state, record)
-        theirs = f": the base station's own noise makes {station:.2g} nT of it" if 2.0 * station > slow else ""
+        theirs = f": the base station's own noise makes {station:.2g} nT of it" if TWICE * station > slow else ""
         words.append(f"{slow:.3g} nT rms of |b| - F is not white{theirs}")
     return words
 
