@@ -18,6 +18,7 @@ from magtensor.loop.refit import joint_state
 from magtensor.loop.scoring import Scorer
 from magtensor.loop.separation import SEPARATION
 from magtensor.loop.settings import Forms, Frequencies, Range, profiled
+from magtensor.loop.split import coefficients
 from magtensor.loop.terms import Terms
 from magtensor.loop.waveform import NAME
 
@@ -28,10 +29,15 @@ _RESTS = 0.02  # relative: a setting that moves no further is settled
 
 def adopt(record: Record, state: State, chosen: Candidate, how: Fitting) -> State:
     """Refit with the chosen model, first on all sensors, then on those that show it."""
+    models = [*state.adopted, chosen.model]
     # what it found of the others too: begun from zero, a strong slow effect would pass for the colour of the noise
-    moves = np.split(chosen.assessment.theta, np.cumsum([len(t) for t in state.theta]))
-    start = [t + move for t, move in zip([*state.theta, np.zeros(chosen.terms.count)], moves, strict=True)]
-    after = joint_state(record, [*state.adopted, chosen.model], how, start)
+    if chosen.moved is not None:
+        place, models[place] = chosen.moved
+        start = coefficients(state, chosen)
+    else:
+        moves = np.split(chosen.assessment.theta, np.cumsum([len(t) for t in state.theta]))
+        start = [t + move for t, move in zip([*state.theta, np.zeros(chosen.terms.count)], moves, strict=True)]
+    after = joint_state(record, models, how, start)
     which = len(state.adopted)
     sensors = _sensors_showing(after, which)
     if sensors is None or not _spare(after, which, sensors):

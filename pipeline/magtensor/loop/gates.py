@@ -39,6 +39,8 @@ class Candidate:
         beside: sum of squares that the models adopted before explain to first order; kin: the same of those that have
             its sensors and what drives it (`kin`).
         before: what it was judged against, where that is the fit with it, its part put back (`own_fit`).
+        moved: the place of an adopted model that takes other settings beside it, and that model with these (`split`);
+            `terms` are of both then, the one that takes other settings first.
     """
 
     model: Adopted
@@ -53,6 +55,7 @@ class Candidate:
     beside: float = 0.0
     kin: float = 0.0
     before: State | None = None
+    moved: tuple[int, Adopted] | None = None
 
     def among(self, models: int) -> Candidate:
         """The same, found among so many models rather than by itself."""

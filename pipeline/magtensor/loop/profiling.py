@@ -42,10 +42,10 @@ def repeatable(model: Component) -> bool:
     one, and what a second leaves is better called more of the same than something else.
     """
     grids = profiled(model).values()
-    return any(isinstance(g, (AnyChannel, EventTimes, Frequencies)) or _of_ratios(g) for g in grids)
+    return any(isinstance(g, (AnyChannel, EventTimes, Frequencies)) or of_ratios(g) for g in grids)
 
 
-def _of_ratios(grid: Any) -> bool:
+def of_ratios(grid: Any) -> bool:
     """A setting whose values differ by factors: a time constant, lag or width."""
     return isinstance(grid, Range) and (grid.low >= 0 or grid.spacing == "log")
 
@@ -64,7 +64,7 @@ def already(adopted: Iterable[Adopted], model: Component, settings: Mapping[str,
     told apart."""
     grids = profiled(model)
     channels = {n for n, g in grids.items() if isinstance(g, AnyChannel)}
-    ranges = {n for n, g in grids.items() if _of_ratios(g)}
+    ranges = {n for n, g in grids.items() if of_ratios(g)}
     same = channels or set(grids) - ranges
     return any(
         all(one.settings.get(n) == settings.get(n) for n in same)
@@ -212,7 +212,7 @@ def refined(model: Component, settings: dict[str, Any], state: State, failed: di
             best = _its_time(gain, Scorer(residual, given, WHITE), at, (low, high), best, state.excitation.spacing)
         else:
             best = golden(gain, low, high, best, _OF_A_LINE if isinstance(grid, Frequencies) else REFINEMENTS)
-        if low <= 0.0 <= high and _of_ratios(grid) and gain(best) - gain(0.0) < SEPARATION / 2.0:
+        if low <= 0.0 <= high and of_ratios(grid) and gain(best) - gain(0.0) < SEPARATION / 2.0:
             best = 0.0
         settings = {**settings, name: best}
     settings = begun(model, settings, state, few)

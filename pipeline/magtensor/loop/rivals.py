@@ -78,6 +78,12 @@ def part_of(candidate: Candidate, other: Candidate, state: State) -> bool:
     return own < SMALL_PART * whole and both - whole < SMALL_PART * own
 
 
+def overlaps(candidate: Candidate, other: Candidate, state: State) -> bool:
+    """Whether most of what a candidate predicts another one does."""
+    whole, own, both = _beside(candidate, other, state)
+    return both - whole < SMALL_PART * own
+
+
 def part_of_a_drift(candidate: Candidate, candidates: Sequence[Candidate], state: State) -> str:
     """The name of a model of what lasts that predicts as much as a candidate of what happened once, and leaves it
     next to nothing; "" where there is none.

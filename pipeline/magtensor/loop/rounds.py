@@ -27,13 +27,15 @@ from magtensor.loop.model import Fitting, Record, State, generic
 from magtensor.loop.needs import missing
 from magtensor.loop.own_fit import at_their_own_fit
 from magtensor.loop.profiling import already, repeatable
-from magtensor.loop.rivals import containing, hardly_begun, part_of, part_of_a_drift, simplest
+from magtensor.loop.rivals import containing, hardly_begun, overlaps, part_of, part_of_a_drift, simplest
 from magtensor.loop.screening import candidates_of
 from magtensor.loop.spectrum import spectral_lines
+from magtensor.loop.split import split
 from magtensor.loop.trial import Trial, on_the_folds_of, per_sample, trial
 from magtensor.loop.which_channel import nearest
 
 MOST_OF_A_SAMPLE = 50.0  # log likelihood: half of the largest squared residual of a sample that noise may explain
+ONE_OF_A_KIND = "fitted, its settings are those of what is adopted already"  # its law is no single one
 ROUNDING = 1e-4  # mean square of the whitened residual: far below the least noise that any sensor is believed to have
 
 
@@ -77,8 +79,15 @@ class Rounds:
 
     def candidates(self, state: State, record: Record, how: Fitting) -> list[Candidate]:
         """What may be adopted beside what is."""
-        found = candidates_of(state, self.open_models(state), self.failed, self.alpha)
-        return at_their_own_fit(found, record, state, how)
+        models = self.open_models(state)
+        found = at_their_own_fit(candidates_of(state, models, self.failed, self.alpha), record, state, how)
+        for two in split(state, self.fixed, self.alpha, len(models)):
+            same = next((c for c in found if c.model.name == two.model.name), None)
+            if two.passes and (
+                same is None or not same.passes or same.assessment.gain.total < two.assessment.gain.total
+            ):
+                found = [c for c in found if c is not same] + [two]
+        return sorted(found, key=lambda c: -c.assessment.gain.total)
 
     def open_models(self, state: State) -> list[Component]:
         """The models that have what they need and are not in already, or can be in more than once."""
@@ -235,8 +244,12 @@ def _first_kept(
         if after is None:
             refused[chosen.model.name] = why
             for c in candidates:
-                if c.passes and c.model.name not in refused and part_of(c, chosen, before.state):
+                if not c.passes or c.model.name in refused:
+                    continue
+                if part_of(c, chosen, before.state):
                     refused[c.model.name] = f"a small part of what {chosen.model.name} explains, which failed"
+                elif why == ONE_OF_A_KIND and overlaps(c, chosen, before.state):
+                    refused[c.model.name] = f"most of it is what the law of {chosen.model.name} leaves"
             continue
         last, dropped = eliminate(record, after.state, how, fixed)
         if dropped:
@@ -269,7 +282,7 @@ def _kept(record: Record, before: Trial, chosen: Candidate, how: Fitting) -> tup
     acts_on = model.sensors or tuple(record.sensors)
     same = [a for a in after.state.adopted[:which] if set(a.sensors or record.sensors) & set(acts_on)]
     if not channels_of(model, after.state.excitation) and already(same, model.component, model.settings):
-        return None, "fitted, its settings are those of what is adopted already"
+        return None, ONE_OF_A_KIND
     slow, channels = hardly_begun(chosen, after.state.excitation), sorted(channels_of(model, after.state.excitation))
     if (slow or channels) and of_all_alike(after.state, which):
         drift = "drifts" if slow else f"follows {' and '.join(channels)}"

@@ -22,7 +22,7 @@ from magtensor.loop.statistics import Gain
 def nearest(chosen: Candidate, state: State, models: int) -> tuple[Candidate, tuple[str, ...]]:
     """A candidate, following the sensors' own channel in the place of one logged elsewhere where held-out blocks do not
     tell the two apart; and the names of the other channels that they do not tell from it. One that slow noise could
-    explain is named, and not taken.
+    explain is named, and not taken. What goes beside another of its kind follows the channel of that one.
 
     Parameters
     ----------
@@ -30,7 +30,7 @@ def nearest(chosen: Candidate, state: State, models: int) -> tuple[Candidate, tu
     """
     component, settings = chosen.model.component, chosen.model.settings
     name = next((n for n, g in profiled(component).items() if isinstance(g, AnyChannel)), None)
-    if name is None or generic(chosen.model):
+    if name is None or generic(chosen.model) or chosen.moved is not None:
         return chosen, ()
     reference = _gain(chosen, chosen, state)
     alike = {str(settings[name]): chosen}
