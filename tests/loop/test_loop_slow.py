@@ -95,6 +95,13 @@ def test_slow_noise_of_a_turning_sensor_is_not_mistaken_for_a_slow_effect(single
     assert np.mean(explained["turned"]) < (9.0 if single else 6.0)
 
 
+def test_of_no_regressors_none_are_left_beside_turned_noise() -> None:
+    """What died away before the first sample that is believed has none."""
+    modes = SlowModes(turning(np.random.default_rng(500), 300))
+    turned = TurnedColour(modes, np.ones(3 * modes.most), Colour(None, 1.0))
+    assert turned.whiten(np.zeros((300, 0))).shape == (300, 0)
+
+
 SECONDS = np.arange(3600) / 2.0
 BENDS = 1e-4  # degC a sample^2, white: an integrated random walk
 

@@ -74,7 +74,7 @@ class SlowModes:
         k, q, n = self.most, coefficients.shape[1], len(self.response)
         spectrum = np.zeros((len(self._held), 3, q))
         spectrum[1 : k + 1] = coefficients.reshape(k, 3, q) / np.sqrt(2.0 * n)
-        out: Array = (self._held @ dct(spectrum, axis=0, type=3)).reshape(-1, q)
+        out: Array = (self._held @ dct(spectrum, axis=0, type=3)).reshape(len(spectrum) * self.step, q)
         return out[:n]
 
     @cached_property
