@@ -87,6 +87,9 @@ def test_a_small_part_of_what_failed_is_no_candidate() -> None:
     assert rivals.part_of(of(0), failed, state)
     assert not rivals.part_of(of(0, 1), failed, state)  # a rival that explains most of it
     assert not rivals.part_of(of(3), failed, state)  # something else
+    assert not rivals.part_of(of(0, 3), failed, state)
+    assert rivals.overlaps(of(0), failed, state) and rivals.overlaps(of(0, 1), failed, state)
+    assert not rivals.overlaps(of(3), failed, state)
 
 
 def test_of_every_model_it_is_told_why_it_was_not_adopted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
