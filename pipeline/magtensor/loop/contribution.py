@@ -93,6 +93,17 @@ def put_back(residual: Residual, terms: Terms, theta: Array) -> Residual:
     return taken_off(residual, terms, -theta)
 
 
+def put_back_one(state: State, place: int) -> State:
+    """The state as it would be without one of the models, to first order: its part in the residual, the terms of the
+    others alone."""
+    assert state.terms is not None
+    own = slices(state)[place]
+    mine = state.terms.only(range(own.start, own.stop))
+    rest = [i for i in range(state.terms.count) if not own.start <= i < own.stop]
+    residual = put_back(state.residual, mine, state.theta[place])
+    return replace(state, residual=residual, terms=state.terms.only(rest) if rest else None)
+
+
 def eliminate(record: Record, state: State, how: Fitting, fixed: int) -> tuple[State, tuple[str, ...]]:
     """Drop models that no longer earn their place, the weakest first: those whose coefficients are not what their
     settings assume, those that are not significant beside the others, and those without which the others predict

@@ -8,9 +8,8 @@ Beside all that was adopted later one with fewer coefficients may do as well; th
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
-from magtensor.loop.contribution import put_back, slices
+from magtensor.loop.contribution import put_back_one, slices
 from magtensor.loop.found import Step
 from magtensor.loop.gates import Candidate
 from magtensor.loop.model import State, generic
@@ -39,12 +38,7 @@ def _as_good(state: State, place: int, other: Candidate) -> bool:
     assert state.terms is not None
     own = slices(state)[place]
     mine = state.terms.only(range(own.start, own.stop))
-    rest = [i for i in range(state.terms.count) if not own.start <= i < own.stop]
-    without = replace(
-        state,
-        residual=put_back(state.residual, mine, state.theta[place]),
-        terms=state.terms.only(rest) if rest else None,
-    )
+    without = put_back_one(state, place)
     theirs = other.model.terms(state.excitation).at(state.residual.samples)
     best, found = (fold_gain(without, state.colours, terms) for terms in (mine, theirs))
     return not separated(best, found)

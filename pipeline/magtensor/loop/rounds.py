@@ -281,7 +281,8 @@ def _kept(record: Record, before: Trial, chosen: Candidate, how: Fitting) -> tup
     model = after.state.adopted[which]
     acts_on = model.sensors or tuple(record.sensors)
     same = [a for a in after.state.adopted[:which] if set(a.sensors or record.sensors) & set(acts_on)]
-    if not channels_of(model, after.state.excitation) and already(same, model.component, model.settings):
+    two_channels = chosen.moved is None and channels_of(model, after.state.excitation)
+    if not two_channels and already(same, model.component, model.settings):
         return None, ONE_OF_A_KIND
     slow, channels = hardly_begun(chosen, after.state.excitation), sorted(channels_of(model, after.state.excitation))
     if (slow or channels) and of_all_alike(after.state, which):

@@ -2,8 +2,8 @@
 
 A sensor follows its thermometer through its housing and through the board it sits on. Of the two lags the first to be
 adopted lies between them, and beside that compromise neither explains much: what is left looks like a drift. So every
-response that was found is asked for once more as two of its kind, both settings sought together. The two are tested as
-what they explain beside the one that they would replace, which holds for any settings of all three.
+response that was found is asked for once more as two of its kind, both settings sought together in its place. The two
+are then tested as what they explain beside the one that they would replace, which holds for any settings of all three.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 from magtensor.calibration.types import Array
 from magtensor.loop.assessment import WHITE, assess, colours_of, estimated, likeliest
 from magtensor.loop.beginnings import beginning
-from magtensor.loop.contribution import put_back, slices
+from magtensor.loop.contribution import put_back_one
 from magtensor.loop.evidence import Whitened
 from magtensor.loop.gates import Candidate, explained_before
 from magtensor.loop.golden import golden
@@ -53,16 +53,13 @@ def coefficients(state: State, candidate: Candidate) -> list[Array]:
     """Of every model where a joint fit with the two of a candidate begins: of those adopted, then of the second."""
     assert candidate.moved is not None and state.terms is not None
     place, _ = candidate.moved
-    own = slices(state)[place]
-    others = [i for i in range(state.terms.count) if not own.start <= i < own.stop]
-    mine = state.terms.only(range(own.start, own.stop))
-    back = put_back(state.residual, mine, state.theta[place])
-    together = joined([state.terms.only(others), candidate.terms])
-    theta = estimated(back, together, candidate.assessment.colours).theta
-    one, other = np.split(theta[len(others) :], 2)
+    without = put_back_one(state, place)
+    together = candidate.terms if without.terms is None else joined([without.terms, candidate.terms])
+    theta = estimated(without.residual, together, candidate.assessment.colours).theta
     rest = [t for i, t in enumerate(state.theta) if i != place]
-    moved = np.split(theta[: len(others)], np.cumsum([len(t) for t in rest])[:-1]) if rest else []
-    start = [t + move for t, move in zip(rest, moved, strict=True)]
+    *moves, both = np.split(theta, np.cumsum([len(t) for t in rest])) if rest else [theta]
+    one, other = np.split(both, 2)
+    start = [t + move for t, move in zip(rest, moves, strict=True)]
     return [*start[:place], one, *start[place:], other]
 
 
@@ -79,13 +76,13 @@ def _as_two(state: State, place: int, alpha: float, models: int) -> Candidate | 
     pairs = [(a, b) for i, a in enumerate(values) for b in values[i + 1 :] if b > LEAST_RATIO * a]
     if not pairs:
         return None
-    few = Thinned.of(state, SCREENING_SAMPLES)
+    few, (back, given) = Thinned.of(state, SCREENING_SAMPLES), thinned(put_back_one(state, place), SCREENING_SAMPLES)
     terms = {value: _at(few, settings[value]) for value in values}
+    both = [joined([terms[a], terms[b]]) for a, b in pairs]
     starts: dict[tuple[float, float], None] = {}
-    for score in (few.white, few.coloured):
-        each = score.of_each([joined([terms[a], terms[b]]) for a, b in pairs])
-        best = int(np.argmax(each))
-        if np.exp(-each[best]) * len(pairs) * models < HOPELESS:
+    for beside, colours in ((few.white, WHITE), (few.coloured, colours_of(few.residual))):
+        best = int(np.argmax(Scorer(back, given, colours).of_each(both)))
+        if np.exp(-beside(both[best])) * len(pairs) * models < HOPELESS:
             starts[pairs[best]] = None
     found = [_assessed(state, place, name, pair, alpha, len(pairs)).among(models) for pair in starts]
     return max(found, key=lambda c: c.assessment.gain.total, default=None)
@@ -108,7 +105,7 @@ def _assessed(state: State, place: int, name: str, pair: tuple[float, float], al
     model = state.adopted[place]
     grid = sorted(profiled(model.component)[name].values(state.excitation))
     few = Thinned.of(state, REFINING_SAMPLES)
-    residual, given = thinned(state, REFINING_SAMPLES)
+    residual, given = thinned(put_back_one(state, place), REFINING_SAMPLES)
     terms = [_at(few, _with(model, name, value)) for value in pair]
     together = joined([*terms] if given is None else [given, *terms])
     score = Scorer(residual, given, likeliest(residual, together, [colours_of(residual), WHITE]).colours)
