@@ -54,8 +54,8 @@ every recipe.
   `x.one_each` (one coefficient a sensor), `x.shared` (one for all), `x.on_reference`; of a vector that sensors see,
   times a course, `x.one_each_sensing` and `x.shared_sensing` are the same at a fraction of the cost; `joined` puts
   several together.
-- Keyword parameters are settings: a type, how it is profiled (`Range`, `Choice`, `Forms`, `Beginning`, `AnyChannel`,
-  `EventTimes`, `Frequencies`, `Duration`), a description, and a default.
+- Keyword parameters are settings: a type, how it is profiled (`Range`, `Choice`, `Orders`, `Laws`, `Forms`,
+  `Beginning`, `AnyChannel`, `EventTimes`, `Frequencies`, `Duration`), a description, and a default.
 - `needs` names what it cannot do without: channels (`current_*`), `attitude`, `position`, `total_field`, `rotation`
   (samples dense enough for rates of change), `gradient` (a field that differs between the sensors); `a|b` where one of
   two will do.

@@ -1,6 +1,6 @@
 """Error models of time: drifts, warming up, jumps."""
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field
@@ -8,35 +8,56 @@ from pydantic import Field
 from magtensor.calibration.types import Array
 from magtensor.components import error_model
 from magtensor.loop.excitation import Excitation
-from magtensor.loop.settings import Duration, EventTimes, Orders, Range
+from magtensor.loop.settings import Duration, EventTimes, Laws, Orders, Range
 from magtensor.loop.terms import Terms, joined
 from magtensor_effects.forms import OfField
 
-Order = Annotated[int, Orders((1, 2, 3)), Field(ge=1, le=3, description="highest power of time")]
+Order = Annotated[int, Orders((1, 2, 3)), Field(ge=1, le=3, description="highest power of time, or what it goes as")]
 Span = Annotated[
     float,
     Duration(),
     Field(gt=0, description="time from the start over which the course is known, s; later it stays as at the end"),
 ]
 
+LAWS = ("time", "root", "logarithm")
+Law = Annotated[
+    Literal["time", "root", "logarithm"],
+    Laws(LAWS),
+    Field(
+        description="powers of the time since the start; of its square root, as what diffuses; "
+        "or of the logarithm of 1 + 100 times the part of span_s, as what ages"
+    ),
+]
+PARTS = 100.0  # of the span, the first of which the logarithm begins with
+
 EventTime = Annotated[float, EventTimes(), Field(description="time of the jump, s since the survey's start")]
 
 
-def courses(x: Excitation, order: int, span_s: float) -> list[Array]:
-    """Legendre polynomials 1 to `order` of time, from -1 at the start to 1 after span_s."""
-    u = np.clip(2.0 * x.elapsed / span_s - 1.0, -1.0, 1.0)
+def courses(x: Excitation, order: int, span_s: float, law: str = LAWS[0]) -> list[Array]:
+    """Legendre polynomials 1 to `order` of time, or of what a law makes of it, from -1 at the start to 1 after span_s.
+
+    Those of the logarithm follow a drift as log(1 + t / tau) for tau from a third to a thousandth of span_s to 3 % of
+    its size or better with order 3.
+    """
+    part = np.clip(x.elapsed / span_s, 0.0, 1.0)
+    if law == "root":
+        part = np.sqrt(part)
+    elif law == "logarithm":
+        part = np.log1p(PARTS * part) / np.log1p(PARTS)
+    u = 2.0 * part - 1.0
     return [np.polynomial.legendre.Legendre.basis(k)(u) for k in range(1, order + 1)]
 
 
 @error_model("instrument", source="zero drift of fluxgates", typical="some nT/h after switch-on, fluxgate zero drift")
-def offset_drift(x: Excitation, *, order: Order = 1, span_s: Span = 3600.0) -> Terms:
+def offset_drift(x: Excitation, *, order: Order = 1, span_s: Span = 3600.0, law: Law = "time") -> Terms:
     """Each axis's offset drifts with time.
 
-    Legendre polynomials of time over span_s: the coefficient of P1 is half the change from the start to the end.
-    One coefficient an axis and order. A drift is not predicted beyond span_s. Rivals: whatever else changes steadily
-    with time (`warm_up`, `temperature_offset`); `scale_drift` where the attitude hardly changes.
+    Legendre polynomials of time, its square root or its logarithm over span_s: the coefficient of P1 is half the change
+    from the start to the end. One coefficient an axis and order. A drift is not predicted beyond span_s. Rivals:
+    whatever else changes steadily with time (`warm_up`, `temperature_offset`); `scale_drift` where the attitude hardly
+    changes.
     """
-    named = enumerate(courses(x, order, span_s), start=1)
+    named = enumerate(courses(x, order, span_s, law), start=1)
     return joined([x.offsets(c, "nT", f"P{k} ") for k, c in named])
 
 
@@ -45,13 +66,16 @@ def offset_drift(x: Excitation, *, order: Order = 1, span_s: Span = 3600.0) -> T
     source="Yin and Luhr 2011 (CHAMP); Olsen et al. 2003 (Oersted)",
     typical="-79 ppm/yr (Swarm), as the logarithm of time (CHAMP) after launch",
 )
-def scale_drift(x: Excitation, *, order: Order = 1, span_s: Span = 3600.0, of_field: OfField = False) -> Terms:
+def scale_drift(
+    x: Excitation, *, order: Order = 1, span_s: Span = 3600.0, law: Law = "time", of_field: OfField = False
+) -> Terms:
     """Each axis's scale factor drifts with time.
 
-    Legendre polynomials of time over span_s times the axis's own output: the coefficient of P1 is half the change
-    from the start to the end. Rivals: `reference_scale` where the total field changes steadily; `temperature_scale`.
+    Legendre polynomials of time, its square root or its logarithm over span_s, times the axis's own output: the
+    coefficient of P1 is half the change from the start to the end. Rivals: `reference_scale` where the total field
+    changes steadily; `temperature_scale`.
     """
-    named = enumerate(courses(x, order, span_s), start=1)
+    named = enumerate(courses(x, order, span_s, law), start=1)
     return joined([x.scales(1e-6 * c, "ppm", f"P{k} ", of_field=of_field) for k, c in named])
 
 

@@ -12,7 +12,7 @@ from magtensor.components import error_model
 from magtensor.loop.excitation import Excitation
 from magtensor.loop.settings import Delays
 from magtensor.loop.terms import Terms, joined
-from magtensor_effects.ageing import EventTime, Order, Span, courses
+from magtensor_effects.ageing import EventTime, Law, Order, Span, courses
 
 MOST_EXCESS = 0.75  # of the recorded variation: four times that of the site
 NEARBY_S = 2.0  # shorter delays show as the slope over this time
@@ -99,15 +99,15 @@ def reference_clock(
     typical="below 1 nT a day for a proton magnetometer, some nT in an hour where its place or its sensor warms up",
     pointwise=True,
 )
-def reference_drift(x: Excitation, *, order: Order = 1, span_s: Span = 3600.0) -> Terms:
+def reference_drift(x: Excitation, *, order: Order = 1, span_s: Span = 3600.0, law: Law = "time") -> Terms:
     """The base station's total field drifts.
 
-    Legendre polynomials of time over span_s, less their values at the start, when the station is taken to be right: the
-    coefficient of P1 is half the change from the start to the end. Common to all sensors, so the tensor does not feel
-    it. Rival: `scale_drift` with one course for all axes of all sensors, which nothing but another reference would tell
-    from it.
+    Legendre polynomials of time, its square root or its logarithm over span_s, less their values at the start, when the
+    station is taken to be right: the coefficient of P1 is half the change from the start to the end. Common to all
+    sensors, so the tensor does not feel it. Rival: `scale_drift` with one course for all axes of all sensors, which
+    nothing but another reference would tell from it.
     """
-    named = enumerate(courses(x, order, span_s), start=1)
+    named = enumerate(courses(x, order, span_s, law), start=1)
     return joined([x.on_reference(course - (-1.0) ** k, "nT", f"P{k}") for k, course in named])
 
 

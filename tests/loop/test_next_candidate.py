@@ -11,6 +11,7 @@ import pytest
 from loop_cases import BASE, adopted_names, lasting_effects, linear_state, scenario, synthetic, verdict_of
 
 from magtensor.loop import by_hand, rivals, rounds
+from magtensor.loop.course_of_time import BesideTime
 from magtensor.loop.gates import ALPHA
 from magtensor.loop.model import Adopted, Fitting, Record, State
 from magtensor.loop.terms import Terms
@@ -134,6 +135,7 @@ def test_what_another_width_of_an_adopted_law_explains_is_no_other_effect(
     monkeypatch.setattr(rounds, "simplest", unchanged)
     monkeypatch.setattr(rounds, "nearest", unchanged)
     monkeypatch.setattr(rounds, "part_of_a_drift", lambda *_: "")
+    monkeypatch.setattr(rounds, "beside_time", lambda *_: BesideTime(True))
     monkeypatch.setattr(rounds, "part_of", lambda *_: False)
     monkeypatch.setattr(rounds, "overlaps", lambda c, failed, _: failed is width and c is creep)
     for each in (width, creep, other):

@@ -36,11 +36,11 @@ class Colours:
 WHITE = Colours(Colour(None, 1.0), Colour(None, 1.0))
 
 
-def colours_of(residual: Residual, *, stiff: bool = False) -> Colours:
-    """Fit both; `stiff` as in `colour_of`."""
+def colours_of(residual: Residual, *, stiff: bool = False, above: int = 1) -> Colours:
+    """Fit both; `stiff` and, across, `above` as in `colour_of`."""
     white = Colour(None, 1.0)
     size = len(residual.noise)
-    across = colour_of(residual.across, size - 3, stiff=stiff) if residual.across is not None else white
+    across = colour_of(residual.across, size - 3, stiff=stiff, above=above) if residual.across is not None else white
     return Colours(across, white if residual.along is None else _along(residual, residual.along, across, stiff))
 
 

@@ -74,7 +74,7 @@ def with_beginning(
             free = estimated_in(white, joined([now, dying])).theta
             theta = free[len(free) - dying.count - now.count : len(free) - dying.count]
         outputs = len(white.residual.noise)
-        courses = [_one(slope.contribution(theta, outputs), n) for slope, n in zip(slopes, names, strict=True)]
+        courses = [one_pattern(slope.contribution(theta, outputs), n) for slope, n in zip(slopes, names, strict=True)]
         estimate = estimated_in(white, joined([now, *courses]))
         own = estimate.theta[-now.count - len(names) :]
         theta, moved = own[: now.count], own[now.count :]
@@ -114,7 +114,7 @@ def _moving(slope: Terms) -> list[int]:
     return sorted({int(t) for t, s in zip(slope.part_term, slope.part_series, strict=True) if changing[s]})
 
 
-def _one(course: np.ndarray[Any, Any], name: str) -> Terms:
+def one_pattern(course: np.ndarray[Any, Any], name: str) -> Terms:
     """One coefficient for a pattern (N, 3 S)."""
     outputs = np.arange(course.shape[1])
     return Terms((name,), ("",), ("",), course, np.zeros_like(outputs), outputs, outputs)

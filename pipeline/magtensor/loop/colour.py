@@ -66,7 +66,7 @@ class Colour:
         return out.reshape(series.shape)
 
 
-def colour_of(series: Array, freedom: float | None = None, *, stiff: bool = False) -> Colour:
+def colour_of(series: Array, freedom: float | None = None, *, stiff: bool = False, above: int = 1) -> Colour:
     """Fit white noise plus slow processes to the mean spectrum of the columns of (N, K).
 
     Parameters
@@ -75,6 +75,7 @@ def colour_of(series: Array, freedom: float | None = None, *, stiff: bool = Fals
     freedom: how many independent values a row holds; K if None.
     stiff: white, 1/f, 1/f^2 and processes of a few samples only, so that the lowest frequencies follow from the
         middle ones. What a regressor took away there, having followed the noise, is then not missed.
+    above: number of the lowest cosine frequency that counts, of which many regressors left nothing below.
     """
     from scipy.optimize import nnls
 
@@ -86,6 +87,7 @@ def colour_of(series: Array, freedom: float | None = None, *, stiff: bool = Fals
     power = _spectrum(columns, share)
     frequency = np.arange(1, n) / (2.0 * n)  # cycles per sample
     edges = np.unique(np.round(np.geomspace(1, n, min(60, n // 4))).astype(int))
+    edges = edges[edges >= min(above, n // 2)]
     level = np.add.reduceat(power, edges[:-1] - 1) / np.diff(edges)
     centre = (edges[:-1] + edges[1:] - 1) / (4.0 * n)
     count = np.diff(edges) * k * share

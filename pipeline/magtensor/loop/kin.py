@@ -8,15 +8,16 @@ sensors, and is that small beside it, is more of the same and no second cause.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
 from magtensor.loop.assessment import NEARLY_ALL, Assessment
 from magtensor.loop.excitation import Excitation
-from magtensor.loop.gates import explained_by
+from magtensor.loop.gates import Candidate, explained_by
 from magtensor.loop.log_noise import channels_of
 from magtensor.loop.model import Adopted, State
-from magtensor.loop.settings import Duration, EventTimes, profiled
+from magtensor.loop.settings import Duration, EventTimes, Range, profiled
 from magtensor.loop.terms import Terms
 
 TIME = " time"  # no channel has that name
@@ -24,12 +25,20 @@ TIME = " time"  # no channel has that name
 
 def explained_by_kin(state: State, model: Adopted, terms: Terms, assessment: Assessment) -> float:
     """Sum of squares that adopted effects of another name explain which have the candidate's sensors and driver."""
-    own = drivers(model, state.excitation)
+    return _explained(state, drivers(model, state.excitation), model.name, terms, assessment)
+
+
+def explained_by_courses(state: State, candidate: Candidate) -> float:
+    """Sum of squares that adopted effects explain which go with time and have the candidate's sensors."""
+    return _explained(state, {TIME}, candidate.model.name, candidate.terms, candidate.assessment)
+
+
+def _explained(state: State, by: set[str], name: str, terms: Terms, assessment: Assessment) -> float:
     kin = [
         place
         for place, other in enumerate(state.adopted)
-        if other.name != model.name
-        and own & drivers(other, state.excitation)
+        if other.name != name
+        and by & drivers(other, state.excitation)
         and _held_by(other.sensors or state.excitation.sensors, state, terms, assessment) > NEARLY_ALL
     ]
     return explained_by(state, kin) if kin else 0.0
@@ -38,9 +47,12 @@ def explained_by_kin(state: State, model: Adopted, terms: Terms, assessment: Ass
 def drivers(model: Adopted, x: Excitation) -> set[str]:
     """The channels that a model follows, and `TIME` of what drifts, warms up or happens once."""
     found = channels_of(model, x) | {need for need in model.component.declared({}).needs if need in x.logged}
-    marks = profiled(model.component).values()
-    goes_with_time = any(isinstance(m, (Duration, EventTimes)) for m in marks)
-    return found | ({TIME} if goes_with_time else set())
+    return found | ({TIME} if any(map(_of_time, profiled(model.component).values())) else set())
+
+
+def _of_time(grid: Any) -> bool:
+    """A setting that times of the survey, or parts of it, are chosen for."""
+    return isinstance(grid, (Duration, EventTimes)) or (isinstance(grid, Range) and grid.of_duration)
 
 
 def _held_by(sensors: Sequence[str], state: State, terms: Terms, assessment: Assessment) -> float:

@@ -19,7 +19,7 @@ from magtensor.loop.evidence import Whitened
 from magtensor.loop.gates import Candidate
 from magtensor.loop.model import Fitting, Record, State
 from magtensor.loop.refit import joint_state
-from magtensor.loop.separation import fold_gain, lower_orders, separated
+from magtensor.loop.separation import fold_gain, plainer, separated
 from magtensor.loop.settings import profiled
 from magtensor.loop.terms import Terms
 from magtensor.sharing import shared_out
@@ -31,7 +31,7 @@ def at_their_own_fit(candidates: Sequence[Candidate], record: Record, state: Sta
     """The candidates, best first; those that are significant and not small judged anew.
 
     Each is fitted together with all that is adopted, on the samples that the fit without it believes. What it explains
-    is put back into the residual of that fit, to first order, and assessed there; so are the orders below its own.
+    is put back into the residual of that fit, to first order, and assessed there; so are its plainer forms.
     """
     large = [c for c in candidates if c.significant and _large(c, state)]
     each_with = [[c, *_below(c, state)] for c in large]
@@ -46,9 +46,9 @@ def at_their_own_fit(candidates: Sequence[Candidate], record: Record, state: Sta
 
 
 def _below(candidate: Candidate, state: State) -> list[Candidate]:
-    """The same model with every lower order."""
+    """The same model in every plainer form."""
     model, residual, below = candidate.model, state.residual, []
-    for settings in lower_orders(model.settings, profiled(model.component)):
+    for settings in plainer(model.settings, profiled(model.component)):
         lower = replace(model, settings=settings)
         terms = lower.terms(state.excitation).at(residual.samples)
         now = Whitened.of(residual, state.colours.across, state.colours.along, state.terms)
@@ -63,7 +63,7 @@ def _there(candidate: Candidate, found: tuple[State, Terms, Assessment], state: 
 
 
 def _lowest(best: Candidate, below: Sequence[Candidate], state: State) -> Candidate:
-    """The lowest order that held-out blocks do not separate from the best, each judged at its own fit."""
+    """The plainest form that held-out blocks do not separate from the best, each judged at its own fit."""
     colours = best.assessment.colours
     reference = fold_gain(best.before or state, colours, best.terms)
     kept = (c for c in below if not separated(reference, fold_gain(c.before or state, colours, c.terms)))

@@ -17,6 +17,7 @@ from magtensor.loop.contribution import (
     share_of_the_field,
     without_models,
 )
+from magtensor.loop.course_of_time import beside_time, rivals_in_time
 from magtensor.loop.exchange import looked_at_again, simpler
 from magtensor.loop.excitation import Excitation
 from magtensor.loop.found import Step
@@ -238,6 +239,12 @@ def _first_kept(
             refused[chosen.model.name] = f"{name}, which lasts, predicts as much"
             continue
         chosen, channels = nearest(chosen, before.state, models)
+        time = beside_time(chosen, before.state)
+        if time.refused:
+            refused[chosen.model.name] = time.refused
+            continue
+        if not time.seen:
+            rivals = tuple(sorted({*rivals, *rivals_in_time(chosen, possible, before.state)}))
         if say is not None:
             say(f"adopting {chosen.model.name}")
         after, why = _kept(record, before, chosen, how)

@@ -19,7 +19,7 @@ from magtensor.loop.model import Adopted, State, generic
 from magtensor.loop.own_noise import OwnNoise
 from magtensor.loop.profiling import REFINING_SAMPLES, SCREENING_SAMPLES, Thinned, best_settings, refined, terms_of
 from magtensor.loop.scoring import Scorer
-from magtensor.loop.separation import Assessed, lower_orders, lowest
+from magtensor.loop.separation import Assessed, lowest, plainer
 from magtensor.loop.settings import profiled
 from magtensor.loop.several_logs import of_another_log
 from magtensor.loop.terms import Terms
@@ -90,7 +90,7 @@ def _scored_on_all(state: State, scored: Sequence[_Screened], failed: dict[str, 
 
 
 def _looked_at(state: State, scored: Sequence[_Screened], failed: dict[str, str]) -> list[Assessed]:
-    """Models with their settings refined, and with lower orders where they have such, assessed on all samples."""
+    """Models with their settings refined, and in the plainer forms that they have, assessed on all samples."""
     residual = state.residual
     now = Whitened.of(residual, state.colours.across, state.colours.along, state.terms)
     noise = OwnNoise(residual, state.terms)
@@ -103,7 +103,7 @@ def _looked_at(state: State, scored: Sequence[_Screened], failed: dict[str, str]
     distinct: dict[tuple[str, str], _Screened] = {}
     for each, (settings, fails) in zip(starts, shared_out(moved, starts), strict=True):
         failed.update(fails)
-        for one in (settings, *lower_orders(settings, profiled(each.model))):
+        for one in (settings, *plainer(settings, profiled(each.model))):
             distinct.setdefault((each.model.name, str(one)), replace(each, settings=one))
 
     def assessed(each: _Screened) -> tuple[Terms, Assessment]:
@@ -155,7 +155,7 @@ def _shortlist(scored: Sequence[_Screened], score: Callable[[_Screened], float],
 
 
 def _one_each(state: State, assessed: Sequence[Assessed]) -> list[Assessed]:
-    """Of a model that was assessed with several settings, the one that predicts best, at the lowest order that does."""
+    """Of a model assessed with several settings the one that predicts best, in the plainest form that does."""
     named: dict[str, list[Assessed]] = {}
     for each in assessed:
         named.setdefault(each[0].name, []).append(each)

@@ -1,4 +1,4 @@
-"""Whether held-out blocks tell two models apart, and the lowest order of one model that they leave."""
+"""Whether held-out blocks tell two models apart, and the plainest form of one model that they leave."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from magtensor.loop.assessment import Assessment, Colours, block_count
 from magtensor.loop.evidence import grams
 from magtensor.loop.model import Adopted, State
-from magtensor.loop.settings import Orders
+from magtensor.loop.settings import Laws, Orders
 from magtensor.loop.statistics import Gain, held_out_gain
 from magtensor.loop.terms import Terms, joined
 
@@ -39,19 +39,26 @@ def separated(best: Gain, other: Gain, spare: int = 0) -> bool:
 Assessed = tuple[Adopted, float, Terms, Assessment]  # a model, independent tests of its settings, terms, what data say
 
 
-def lower_orders(settings: Mapping[str, Any], marks: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Settings of a model with every order below theirs; `marks` say which setting is one."""
-    orders = {name: mark.options for name, mark in marks.items() if isinstance(mark, Orders)}
-    return [{**settings, name: k} for name, options in orders.items() for k in options if k < settings[name]]
+def plainer(settings: Mapping[str, Any], marks: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Settings of a model with lower orders than theirs, and with the first law, that first; `marks` say which settings
+    are orders and laws."""
+    found = [dict(settings)]
+    for name, mark in marks.items():
+        if isinstance(mark, Orders):
+            found = [{**s, name: k} for s in found for k in mark.options if k <= settings[name]]
+        if isinstance(mark, Laws):
+            found = [{**s, name: law} for s in found for law in dict.fromkeys((mark.options[0], settings[name]))]
+    return [s for s in found if s != settings]
 
 
 def lowest(state: State, assessed: Sequence[Assessed], marks: Mapping[str, Any]) -> Assessed:
-    """Of one model with several settings the one that predicts best, or the lowest order not separated from it."""
+    """Of one model with several settings the one that predicts best, or the plainest not separated from it."""
     best = max(assessed, key=lambda each: each[3].gain.total)
-    below = lower_orders(best[0].settings, marks)
+    below = plainer(best[0].settings, marks)
     lower = [each for each in assessed if each[0].settings in below]
     if not lower:
         return best
+    lower.sort(key=lambda each: below.index(dict(each[0].settings)))
     colours = best[3].colours
     reference = fold_gain(state, colours, best[2])
     kept = (each for each in lower if not separated(reference, fold_gain(state, colours, each[2])))

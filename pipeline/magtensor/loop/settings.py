@@ -199,6 +199,14 @@ class Orders(Choice):
 
 
 @dataclass(frozen=True)
+class Laws(Choice):
+    """Laws that the same thing may follow, all of them searched with.
+
+    The first is the plainest: it is chosen where held-out blocks do not separate it from the best.
+    """
+
+
+@dataclass(frozen=True)
 class EventTimes:
     """Times at which something may have happened, at a spacing, away from both ends, s after the start.
 

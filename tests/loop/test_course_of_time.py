@@ -1,0 +1,88 @@
+"""A drift of a law that no temperature has, beside a thermometer that settles: the temperature is not accused of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+from loop_cases import BASE, adopted_names, scenario, verdict_of
+from numpy.typing import NDArray
+
+from magtensor.loop.example import example_survey
+from magtensor.registry import Registry
+from magtensor_effects.ageing import courses
+
+Array = NDArray[np.float64]
+MODELS = ("temperature_offset", "temperature_rate", "channel_response", "offset_drift", "warm_up")
+SHORT: dict[str, Any] = {
+    "motion": BASE["motion"] | {"duration_s": 600.0},
+    "instrument": BASE["instrument"] | {"noise": {"white_sd_nT": 0.15}},
+}
+SIZE_NT = 4.0
+LAWS: dict[str, Callable[[Array], Array]] = {
+    "diffusion": np.sqrt,
+    "logarithm": lambda u: np.log1p(30.0 * u) / np.log(31.0),
+    "fourth root": lambda u: u**0.25,
+    "second order": lambda u: 8.0 * u / (1.0 + 7.0 * u),
+    "two exponentials": lambda u: 0.5 * np.exp(-u / 0.05) + 0.5 * np.exp(-u / 0.5),
+    "there and on": lambda u: 1.0 / (1.0 + np.exp(-8.0 * (u - 0.4))),
+    "there and back": lambda u: (2.0 * u - 1.0) ** 4,
+}
+
+
+def drifting(law: str) -> Callable[[Path], None]:
+    """Offsets that follow a law of time, of another size in each axis."""
+
+    def change(path: Path) -> None:
+        with h5py.File(path, "a") as file:
+            time = file["time"][:] - file["time"][0]
+            each = np.random.default_rng(5).standard_normal(file["b_raw"].shape[1:])
+            file["b_raw"][:] = file["b_raw"][:] + SIZE_NT * LAWS[law](time / time[-1])[:, None, None] * each
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("law", "seed"),
+    [
+        ("diffusion", 31),
+        ("logarithm", 33),
+        ("two exponentials", 34),
+        ("there and on", 34),
+        *(
+            pytest.param(law, seed, marks=pytest.mark.long)
+            for law in LAWS
+            for seed in (31, 32, 35)
+            if (law, seed) != ("diffusion", 31)
+        ),
+    ],
+)
+def test_a_thermometer_that_settles_is_not_accused_of_a_drift(law: str, seed: int, tmp_path: Path) -> None:
+    told = verdict_of(tmp_path, scenario(seed, **SHORT), drifting(law), MODELS)
+    assert adopted_names(told) <= {"offset_drift", "warm_up"}
+    if law in ("diffusion", "logarithm"):
+        assert "offset_drift" in adopted_names(told) or adopted_names(told) == {"warm_up"}
+
+
+@pytest.mark.parametrize(
+    "seed", [31, pytest.param(32, marks=pytest.mark.long), pytest.param(33, marks=pytest.mark.long)]
+)
+def test_a_temperature_effect_is_none_the_less_one(seed: int, tmp_path: Path) -> None:
+    effect = {"type": "temperature_offset", "rms_nT": 4.0, "lag_s": 60.0}
+    told = verdict_of(tmp_path, scenario(seed, effect, **SHORT), None, MODELS)
+    assert adopted_names(told) == {"temperature_offset"}
+
+
+@pytest.mark.parametrize("law", ["root", "logarithm"])
+def test_a_law_of_time_goes_from_its_start_to_its_end(law: str) -> None:
+    x = example_survey(Registry.load().find("error_model", "offset_drift"))
+    first, second = courses(x, 2, x.duration, law)
+    part = (x.time - x.time[0]) / x.duration
+    shape = np.sqrt(part) if law == "root" else np.log(1.0 + 100.0 * part) / np.log(101.0)
+    np.testing.assert_allclose(first, 2.0 * shape - 1.0, atol=1e-12)
+    np.testing.assert_allclose(second, (3.0 * first**2 - 1.0) / 2.0, atol=1e-12)
+    np.testing.assert_allclose([first[0], first[-1]], [-1.0, 1.0], atol=1e-12)
