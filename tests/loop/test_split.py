@@ -12,6 +12,10 @@ import pytest
 from loop_cases import BASE, Array, adopted_names, scenario, verdict_of
 from scipy.integrate import solve_ivp
 
+from magtensor.loop.model import Adopted
+from magtensor.loop.profiling import already
+from magtensor.registry import Registry
+
 THERMAL = ("temperature_offset", "temperature_rate", "offset_drift", "warm_up")
 WHITE_NT = 0.15
 CHANNELS = {
@@ -85,3 +89,12 @@ def test_a_drift_beside_one_time_constant_is_a_drift(seed: int, tmp_path: Path) 
     told = verdict_of(tmp_path, thermal(seed), warmed({120.0: 1.0}, rms_nT=4.0, drift_nT=6.0), THERMAL)
     assert [a["error_model"] for a in told["adopted"]].count("temperature_offset") == 1
     assert adopted_names(told) == {"temperature_offset", "offset_drift"}
+
+
+def test_what_two_responses_began_with_makes_them_no_two() -> None:
+    """Nearly one time constant, and other beginnings, are one response."""
+    component = Registry.load().find("error_model", "viscous_magnetisation")
+    settings = {name: parameter.default for name, parameter in component.parameters.items()}
+    one = Adopted(component, settings | {"tau_s": 1.0, "at_start_x_nT": 2e4})
+    assert already([one], component, settings | {"tau_s": 1.4, "at_start_x_nT": -3e4})
+    assert not already([one], component, settings | {"tau_s": 2.5, "at_start_x_nT": 2e4})

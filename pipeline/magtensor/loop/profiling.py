@@ -21,7 +21,7 @@ from magtensor.loop.multiplicity import alike, effective_tests, projected
 from magtensor.loop.residual import Residual
 from magtensor.loop.scoring import Scorer
 from magtensor.loop.separation import SEPARATION
-from magtensor.loop.settings import AnyChannel, EventTimes, Frequencies, Range, profiled
+from magtensor.loop.settings import AnyChannel, Beginning, EventTimes, Frequencies, Range, profiled
 from magtensor.loop.terms import Terms, joined
 
 LEAST_RATIO = 2.0  # of the time constants, lags or widths of a model adopted twice
@@ -65,7 +65,8 @@ def already(adopted: Iterable[Adopted], model: Component, settings: Mapping[str,
     grids = profiled(model)
     channels = {n for n, g in grids.items() if isinstance(g, AnyChannel)}
     ranges = {n for n, g in grids.items() if of_ratios(g)}
-    same = channels or set(grids) - ranges
+    begun = {n for n, g in grids.items() if isinstance(g, Beginning)}
+    same = channels or set(grids) - ranges - begun
     return any(
         all(one.settings.get(n) == settings.get(n) for n in same)
         and not any(_apart(one.settings[n], settings[n]) for n in ranges)
