@@ -1,4 +1,4 @@
-"""A drift of a law that no temperature has, beside a thermometer that settles: the temperature is not accused of it."""
+"""A drift of a law of its own, beside a thermometer that settles: no response to that is accused of it."""
 
 from __future__ import annotations
 
@@ -17,7 +17,14 @@ from magtensor.registry import Registry
 from magtensor_effects.ageing import courses
 
 Array = NDArray[np.float64]
-MODELS = ("temperature_offset", "temperature_rate", "channel_response", "offset_drift", "warm_up")
+MODELS = (
+    "temperature_offset",
+    "temperature_rate",
+    "channel_response",
+    "viscous_magnetisation",
+    "offset_drift",
+    "warm_up",
+)
 SHORT: dict[str, Any] = {
     "motion": BASE["motion"] | {"duration_s": 600.0},
     "instrument": BASE["instrument"] | {"noise": {"white_sd_nT": 0.15}},

@@ -4,7 +4,8 @@ A thermometer that settles is a smooth course of time, and so is a drift. Seen t
 fitted, such a channel comes near to many drifts and follows none of them quite. Two questions tell: does the channel
 explain anything beside smooth courses of time in its place, and do these explain anything beside the channel. Where it
 does not and they do, the data know a course of time that is not the channel's. And where a far larger one is adopted
-already, whose law nobody knows, what the channel would explain beside it may as well be that law's.
+already, whose law nobody knows, what the channel would explain beside it may as well be that law's. What lags the
+field by as much as the survey is long is asked the same.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from magtensor.loop.assessment import WHITE, Likeliest, colours_of, estimated, explained, likeliest
-from magtensor.loop.beginnings import one_pattern
+from magtensor.loop.beginnings import beginning, one_pattern
 from magtensor.loop.contribution import happens_once
 from magtensor.loop.excitation import Excitation
 from magtensor.loop.gates import Candidate
@@ -34,6 +35,7 @@ FIRST_LEFT = 2 * COURSES  # the lowest cosine frequency at which they leave the 
 SEEN = 1e-3  # probability that noise makes a channel explain as much beside them
 MORE = 1e-5  # the same of them beside a channel: slow noise is not known to better than that
 MISSED = 0.1  # of the sum of squares, by the law of a drift: a third of its size, as a line misses of what slows down
+THE_FIELD = "the field"  # no channel has that name
 STEP = 0.01  # of a setting, over which the change of what it explains is taken
 
 
@@ -51,12 +53,12 @@ class BesideTime:
 
 
 def beside_time(candidate: Candidate, state: State) -> BesideTime:
-    """What smooth courses of time in the place of its channel say of a candidate; of one without a channel nothing."""
+    """What smooth courses of time in the place of its channel say of a candidate, or of the field if it lags that; of
+    one without either nothing."""
     before, model = candidate.before or state, candidate.model
     x = before.excitation
-    channels = channels_of(model, x)
-    name = next(iter(channels), "")
-    if len(channels) != 1 or candidate.moved is not None or x.is_vector(name):
+    name = _followed(model, x)
+    if not name or candidate.moved is not None:
         return BesideTime(True)
     residual, given = thinned(before, REFINING_SAMPLES)
     held = [] if given is None else [given]
@@ -86,6 +88,15 @@ def rivals_in_time(candidate: Candidate, possible: Sequence[Candidate], state: S
     return {c.model.name for c in of_time if c is not candidate and overlaps(c, candidate, state)}
 
 
+def _followed(model: Adopted, x: Excitation) -> str:
+    """What a response follows: its channel, or the field if it lags that; "" for no response, and for a vector."""
+    channels = channels_of(model, x)
+    if not channels:
+        return "" if beginning(model.component, model.settings) is None else THE_FIELD
+    (name, *others) = channels
+    return "" if others or x.is_vector(name) else name
+
+
 def _with_slopes(candidate: Candidate, x: Excitation) -> Terms:
     """A candidate's terms, and how what they explain changes with its settings on a range, which are not at their best
     yet: a thousandth of them is more than noise beside a large effect."""
@@ -102,9 +113,11 @@ def _with_slopes(candidate: Candidate, x: Excitation) -> Terms:
 
 
 def _of_time(model: Adopted, x: Excitation, name: str) -> Terms:
-    """What a model makes of smooth courses of time in the place of its channel."""
+    """What a model makes of smooth courses of time in the place of its channel; of the field, offsets."""
     part = (x.time - x.time[0]) / max(x.duration, 1e-300)
     courses = np.polynomial.legendre.legvander(2.0 * np.sqrt(part) - 1.0, COURSES)[:, 1:]
+    if name == THE_FIELD:
+        return joined([x.offsets(course, "nT") for course in courses.T])
     settings = _plain(model)
     shape = x.logged[name].shape
     made = []
