@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from magtensor.loop.assessment import WHITE, Likeliest, colours_of, estimated, explained, likeliest
+from magtensor.loop.assessment import WHITE, colours_of, estimated, explained
 from magtensor.loop.beginnings import beginning, one_pattern
 from magtensor.loop.contribution import happens_once
 from magtensor.loop.excitation import Excitation
@@ -64,20 +64,19 @@ def beside_time(candidate: Candidate, state: State) -> BesideTime:
     held = [] if given is None else [given]
     own = _with_slopes(candidate, x).at(residual.samples)
     courses = _of_time(model, x, name).at(residual.samples)
-
-    def fitted(*terms: Terms) -> Likeliest:
-        return likeliest(residual, joined([*held, *terms]), [colours_of(residual), WHITE])
-
     every = joined([*held, own, courses])
-    both = fitted(own, courses)
-    gained = 2.0 * (both.log_likelihood - fitted(courses).log_likelihood)
-    if _chance(gained, own.count) < SEEN:
+    left = taken_off(residual, every, estimated(residual, every, WHITE).theta)
+    colours = colours_of(left, stiff=True, above=FIRST_LEFT)
+
+    def explains(*terms: Terms) -> float:
+        return explained(estimated(residual, joined([*held, *terms]), colours))
+
+    both = explains(own, courses)
+    if _chance(both - explains(courses), own.count) < SEEN:
         return BesideTime(True)
     if candidate.assessment.gain.total <= MISSED * explained_by_courses(state, candidate):
         return BesideTime(False, f"{name} explains nothing beside smooth courses of time, and a drift is adopted")
-    colours = colours_of(taken_off(residual, every, both.theta), stiff=True, above=FIRST_LEFT)
-    more = explained(estimated(residual, every, colours))
-    if _chance(more - explained(estimated(residual, joined([*held, own]), colours)), courses.count) < MORE:
+    if _chance(both - explains(own), courses.count) < MORE:
         return BesideTime(False, f"smooth courses of time explain more than {name}, and leave it nothing")
     return BesideTime(False)
 
