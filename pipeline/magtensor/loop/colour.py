@@ -75,7 +75,8 @@ def colour_of(series: Array, freedom: float | None = None, *, stiff: bool = Fals
     freedom: how many independent values a row holds; K if None.
     stiff: white, 1/f, 1/f^2 and processes of a few samples only, so that the lowest frequencies follow from the
         middle ones. What a regressor took away there, having followed the noise, is then not missed.
-    above: number of the lowest cosine frequency that counts, of which many regressors left nothing below.
+    above: number of the lowest cosine frequency that counts, where many regressors left nothing below; from what is
+        left white noise and 1/f are known, and no steeper law.
     """
     from scipy.optimize import nnls
 
@@ -91,7 +92,7 @@ def colour_of(series: Array, freedom: float | None = None, *, stiff: bool = Fals
     level = np.add.reduceat(power, edges[:-1] - 1) / np.diff(edges)
     centre = (edges[:-1] + edges[1:] - 1) / (4.0 * n)
     count = np.diff(edges) * k * share
-    shapes_of = _laws if stiff else _relaxations
+    shapes_of = (_laws if above == 1 else _flicker) if stiff else _relaxations
     shapes = shapes_of(centre, n)
     # chi-square weights from the fitted level itself: two rounds settle them, or go in circles where a trend stands far
     # above all else; the likeliest round counts
@@ -162,6 +163,11 @@ def _laws(frequency: Array, n: int, chosen: NDArray[np.bool_] | None = None) -> 
     short = _SHORT[n > _LEAST_OF_SHORT * _SHORT]
     laws = [partial(_power_law, n=n, exponent=1), partial(_power_law, n=n, exponent=2)]
     return _beside_white(frequency, [*laws, *(partial(_relaxation, tau=t) for t in short)], chosen)
+
+
+def _flicker(frequency: Array, n: int, chosen: NDArray[np.bool_] | None = None) -> Array:
+    """White noise and 1/f alone, (M, 2), or where it is not chosen the former, (M, 1)."""
+    return _beside_white(frequency, [partial(_power_law, n=n, exponent=1)], chosen)
 
 
 def _beside_white(
