@@ -70,6 +70,8 @@ def test_what_the_sensors_had_from_before_is_no_second_effect(first: float, seco
     survey, other = warmed(tmp_path, 61, first), warmed(tmp_path, 62, second)
     told = close_loop(survey, verify=other, search=lasting_effects()).verdict
     assert [a["error_model"] for a in told["adopted"]] == ["temperature_offset"], told["unexplained"]["description"]
+    # beside smooth courses of time the thermometer shows nothing: it is chosen, and what would do is named
+    assert "warm_up" in told["adopted"][0]["indistinguishable_from"]
     settings = told["adopted"][0]["settings"]
     assert settings["lag_s"] == pytest.approx(TAU_S, rel=0.1)
     # what dies away shows well, what a degree does less so, and their ratio as that does

@@ -11,8 +11,13 @@ import numpy as np
 import pytest
 from loop_cases import BASE, adopted_names, scenario, verdict_of
 from numpy.typing import NDArray
+from scipy.fft import idct
 
+from magtensor.loop.colour import colour_of
+from magtensor.loop.course_of_time import FIRST_LEFT
 from magtensor.loop.example import example_survey
+from magtensor.loop.separation import plainer
+from magtensor.loop.settings import profiled
 from magtensor.registry import Registry
 from magtensor_effects.ageing import courses
 
@@ -106,3 +111,23 @@ def test_scale_factors_that_age_as_the_logarithm_of_time(tmp_path: Path) -> None
     std = np.array([c["std"] for c in adopted["coefficients"]]).reshape(4, 3)
     assert np.all(np.abs(2.0 * found - ppm) < 2.0 * 4.5 * std)  # P1 is half of it
     assert std.max() < 10.0
+
+
+def test_plainer_are_lower_orders_and_time_itself() -> None:
+    marks = profiled(Registry.load().find("error_model", "offset_drift"))
+    found = plainer({"order": 2, "law": "root", "span_s": 600.0}, marks)
+    assert [(s["order"], s["law"]) for s in found] == [(1, "time"), (1, "root"), (2, "time")]
+    assert plainer({"order": 1, "law": "time", "span_s": 600.0}, marks) == []
+
+
+def test_slow_noise_is_known_below_what_courses_have_taken() -> None:
+    """1/f noise of eleven times the white power at the survey's own frequency, nothing left of it below; the part that
+    is seen tells it to a quarter (standard error, from the Fisher information of nine outputs)."""
+    count, corner = 2400, 10.6
+    k = np.arange(count)
+    spectrum = np.random.default_rng(8).standard_normal((count, 9)) * np.sqrt(1.0 + corner / np.maximum(k, 1))[:, None]
+    spectrum[:FIRST_LEFT] = 0.0
+    found = colour_of(idct(spectrum, axis=0, norm="ortho"), stiff=True, above=FIRST_LEFT)
+    assert found.power is not None
+    assert found.power[1] == pytest.approx(1.0 + corner, rel=0.75)
+    assert colour_of(idct(spectrum, axis=0, norm="ortho"), stiff=True).lowest < 2.0, "as if none were there"
