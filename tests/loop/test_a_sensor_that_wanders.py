@@ -46,6 +46,7 @@ def slow_difference(result: xr.DataTree) -> float:
     return float(np.std([part.mean(axis=0) for part in parts], axis=0).mean())
 
 
+@pytest.mark.long
 def test_the_effect_of_a_quiet_sensor_is_found_and_measured(tmp_path: Path) -> None:
     """Three times the noise of S1; found on S1 alone, and nearly nothing left of it: white noise makes 0.027 nT."""
     path = survey_file(tmp_path, scenario(61, {"type": "temperature_offset", "rms_nT": 0.45, "sensors": ["S1"]}))

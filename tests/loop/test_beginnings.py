@@ -63,9 +63,8 @@ def test_a_lagged_channel_begins_where_it_is_said_to() -> None:
     np.testing.assert_array_equal(x.channel("temperature", 60.0, at_start=np.nan), rest)
 
 
-@pytest.mark.parametrize(
-    ("first", "second"), [(-20.0, -6.0), pytest.param(0.0, 9.0, marks=pytest.mark.long)]
-)  # degC; the thermometer moves by seven
+@pytest.mark.long
+@pytest.mark.parametrize(("first", "second"), [(-20.0, -6.0), (0.0, 9.0)])  # degC; the thermometer moves by seven
 def test_what_the_sensors_had_from_before_is_no_second_effect(first: float, second: float, tmp_path: Path) -> None:
     survey, other = warmed(tmp_path, 61, first), warmed(tmp_path, 62, second)
     told = close_loop(survey, verify=other, search=lasting_effects()).verdict
@@ -127,7 +126,8 @@ def test_iron_that_stood_in_another_field_before_is_no_second_effect(
     assert after < 1.1 * told["error"]["held_out"]["after"]["tensor_rms_nT_per_m"]["all"]
 
 
-@pytest.mark.parametrize("seed", [7, pytest.param(12, marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("seed", [7, 12])
 def test_what_dies_away_is_no_response_to_the_temperature_that_began_with_it(seed: int, tmp_path: Path) -> None:
     """A response with a beginning does as well: the beginning was fitted to the folds that should judge it."""
     effect = {"type": "warm_up", "tau_s": 150.0, "rms_nT": 1.0, "sensors": ["S1", "S4"]}

@@ -63,8 +63,7 @@ def drifting(law: str) -> Callable[[Path], None]:
     "law",
     [
         "logarithm",
-        "two exponentials",
-        *(pytest.param(law, marks=pytest.mark.long) for law in LAWS if law not in ("logarithm", "two exponentials")),
+        *(pytest.param(law, marks=pytest.mark.long) for law in LAWS if law != "logarithm"),
     ],
 )
 def test_a_thermometer_that_settles_is_not_accused_of_a_drift(law: str, seed: int, tmp_path: Path) -> None:

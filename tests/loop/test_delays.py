@@ -96,6 +96,7 @@ def test_a_second_survey_is_brought_back_to_its_time(tmp_path: Path) -> None:
     assert np.sqrt(np.nanmean(errors**2, axis=0)).max() < 1.2 * NOISE_NT  # and what C and o are known to
 
 
+@pytest.mark.long
 def test_a_slip_by_a_sample_half_way(tmp_path: Path) -> None:
     survey = scenario(3, late(0.0, 0.1, 0.0, 0.0, time_s=210.0), motion=HAND, rate_Hz=10.0)
     told = verdict_of(tmp_path, survey, models=TURNING)

@@ -170,6 +170,7 @@ def test_what_lasts_is_left_to_speak_for_itself() -> None:
     assert np.flatnonzero(standing_out([values])).tolist() == [100, 200, 201]
 
 
+@pytest.mark.long
 def test_a_source_that_cannot_be_taken_off_is_told(
     tmp_path: Path, folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

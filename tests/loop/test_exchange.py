@@ -12,6 +12,7 @@ MODELS = ("site_gradient", "fixed_source", "nonlinearity_cubic")
 LOGGED: dict[str, Any] = {"motion": BASE["motion"] | {"duration_s": 600.0}, "logging": {"attitude": True}}
 
 
+@pytest.mark.long
 def test_a_gradient_beside_a_nonlinearity_is_no_source_near_the_rig(tmp_path: Path) -> None:
     effects = ({"type": "site_gradient", "rms_nT": 0.5}, {"type": "nonlinearity_cubic", "rms_nT": 0.3})
     told = verdict_of(tmp_path, scenario(31, *effects, **LOGGED), models=MODELS)

@@ -72,6 +72,7 @@ def test_the_order_of_a_temperature_is_the_lowest_that_does(
     assert (adopted.name, adopted.settings["order"]) == ("temperature_offset", order)
 
 
+@pytest.mark.long
 def test_two_ways_of_the_heat_are_two_lags_of_one_thermometer(tmp_path: Path) -> None:
     effects = [LINE | {"lag_s": lag, "rms_nT": 1.0} for lag in (10.0, 200.0)]
     models = ("temperature_offset", "channel_response", "temperature_rate", "offset_drift")

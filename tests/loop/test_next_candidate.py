@@ -20,6 +20,7 @@ from magtensor.registry import Registry
 EFFECTS = ({"type": "temperature_offset", "rms_nT": 1.0}, {"type": "nonlinearity_cubic", "rms_nT": 0.6})
 
 
+@pytest.mark.long
 def test_what_is_dropped_at_once_does_not_end_the_search(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The first model is dropped at its first trial, as if it raised the error on held-out blocks."""
     first: list[str] = []

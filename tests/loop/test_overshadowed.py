@@ -96,6 +96,7 @@ def test_what_switches_a_few_times_is_no_step_and_nothing_that_passed(
     assert told["steps"][0]["adopted"] in ("offset_step", "passing_source")  # what it is about
 
 
+@pytest.mark.long
 def test_a_source_that_is_taken_out_again_does_not_come_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever is taken out, a source is looked for once more; the search would not end if that found it again."""
 

@@ -84,7 +84,8 @@ def test_one_time_constant_is_one(seed: int, tmp_path: Path) -> None:
     assert lags(told)[0] == pytest.approx(120.0, rel=0.1)
 
 
-@pytest.mark.parametrize("seed", [9, pytest.param(10, marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("seed", [9, 10])
 def test_a_drift_beside_one_time_constant_is_a_drift(seed: int, tmp_path: Path) -> None:
     told = verdict_of(tmp_path, thermal(seed), warmed({120.0: 1.0}, rms_nT=4.0, drift_nT=6.0), THERMAL)
     assert [a["error_model"] for a in told["adopted"]].count("temperature_offset") == 1
