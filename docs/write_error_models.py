@@ -6,8 +6,8 @@ import inspect
 from pathlib import Path
 
 from magtensor.components import Component
-from magtensor.loop.example import example_survey
-from magtensor.loop.settings import (
+from magtensor.error_models.example import example_survey
+from magtensor.error_models.settings import (
     AnyChannel,
     Beginning,
     Choice,

@@ -27,10 +27,10 @@ import yaml
 from loop_surveys import BASE, EFFECTS, MOTIONS, STAGES
 
 from magtensor.errors import MagtensorError
-from magtensor.loop.found import Search
-from magtensor.loop.model import Fitting, Record
-from magtensor.loop.record import record_of
-from magtensor.loop.search import search
+from magtensor.loop.fitting.model import Fitting, Record
+from magtensor.loop.fitting.record import record_of
+from magtensor.loop.searching.found import Search
+from magtensor.loop.searching.search import search
 from magtensor.preparing import empty_survey
 from magtensor.recipe.plan import plan
 from magtensor.recipe.source import parse_yaml

@@ -34,11 +34,11 @@ from loop_power import Trial, models, simulated
 from loop_surveys import EFFECTS, recorded
 
 from magtensor.errors import MagtensorError
-from magtensor.loop.contribution import removal
-from magtensor.loop.errors_before_after import folds_for, held_out_error
-from magtensor.loop.model import Fitting
-from magtensor.loop.search import search
-from magtensor.loop.unexplained import unexplained
+from magtensor.loop.fitting.errors_before_after import folds_for, held_out_error
+from magtensor.loop.fitting.model import Fitting
+from magtensor.loop.searching.contribution import removal
+from magtensor.loop.searching.search import search
+from magtensor.loop.searching.unexplained import unexplained
 
 FIRST_SEED = 5000
 NOISE = "white and 1/f"

@@ -144,13 +144,13 @@ def outcome(flight: Flight) -> dict[str, Any]:
     """What the loop makes of it."""
     from magtensor.calibration.nominal import Nominal
     from magtensor.errors import MagtensorError
-    from magtensor.loop.gates import ALPHA
+    from magtensor.loop.fitting.model import Fitting
     from magtensor.loop.inquiry import Inquiry
-    from magtensor.loop.model import Fitting
     from magtensor.loop.near_nominal import settled
-    from magtensor.loop.outcome import described
-    from magtensor.loop.search import MOST_EFFECTS
-    from magtensor.loop.unexplained import unexplained
+    from magtensor.loop.searching.gates import ALPHA
+    from magtensor.loop.searching.outcome import described
+    from magtensor.loop.searching.search import MOST_EFFECTS
+    from magtensor.loop.searching.unexplained import unexplained
     from magtensor.registry import Registry
 
     registry = Registry.load()

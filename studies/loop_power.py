@@ -44,16 +44,16 @@ from loop_surveys import BASE, EFFECTS, FAMILIES, MOTIONS, recorded, scenario
 
 from magtensor.components import Component
 from magtensor.errors import MagtensorError
-from magtensor.loop.assessment import Colours, colours_of, estimated, explained
-from magtensor.loop.colour import Colour
-from magtensor.loop.found import Search
-from magtensor.loop.model import Fitting, Record, State
-from magtensor.loop.outcome import why
-from magtensor.loop.refit import joint_state
-from magtensor.loop.residual import Residual
-from magtensor.loop.search import search
-from magtensor.loop.turned import TurnedColour
-from magtensor.loop.unexplained import unexplained
+from magtensor.loop.evidence.assessment import Colours, colours_of, estimated, explained
+from magtensor.loop.evidence.colour import Colour
+from magtensor.loop.evidence.residual import Residual
+from magtensor.loop.evidence.turned import TurnedColour
+from magtensor.loop.fitting.model import Fitting, Record, State
+from magtensor.loop.fitting.refit import joint_state
+from magtensor.loop.searching.found import Search
+from magtensor.loop.searching.outcome import why
+from magtensor.loop.searching.search import search
+from magtensor.loop.searching.unexplained import unexplained
 from magtensor.registry import Registry
 from magtensor.simulate import Simulated, simulate
 

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from magtensor.loop.model import Record
-from magtensor.loop.record import record_of
+from magtensor.loop.fitting.model import Record
+from magtensor.loop.fitting.record import record_of
 from magtensor.preparing import empty_survey
 from magtensor.recipe.plan import plan
 from magtensor.recipe.source import parse_yaml

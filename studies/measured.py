@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from magtensor.loop.record import channels_of
+from magtensor.loop.fitting.record import channels_of
 from magtensor.preparing import empty_survey
 from magtensor.recipe.plan import read_plan
 from magtensor.runner import run

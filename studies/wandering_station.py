@@ -33,10 +33,10 @@ from loop_surveys import MOTIONS, recorded, scenario
 from scipy.signal import lfilter
 
 from magtensor.components import Component
-from magtensor.loop.contribution import happens_once
-from magtensor.loop.model import Fitting
-from magtensor.loop.search import search
-from magtensor.loop.unexplained import unexplained
+from magtensor.loop.fitting.model import Fitting
+from magtensor.loop.searching.contribution import happens_once
+from magtensor.loop.searching.search import search
+from magtensor.loop.searching.unexplained import unexplained
 from magtensor.registry import Registry
 from magtensor.simulate import simulate
 

@@ -5,9 +5,9 @@ from typing import Annotated
 from pydantic import Field
 
 from magtensor.components import error_model
-from magtensor.loop.excitation import Excitation
-from magtensor.loop.settings import Range
-from magtensor.loop.terms import Terms
+from magtensor.error_models.excitation import Excitation
+from magtensor.error_models.settings import Range
+from magtensor.error_models.terms import Terms
 
 
 @error_model("instrument", source="an example", typical="0.1 nT where the field stays along one axis for minutes")

@@ -22,7 +22,7 @@ from magtensor.verdict import WORSE, survey_block
 
 if TYPE_CHECKING:
     from magtensor.calibration.types import ArrayCalibration
-    from magtensor.loop.model import Adopted
+    from magtensor.loop.fitting.model import Adopted
     from magtensor.platform_frame import Tied
 
 
@@ -175,7 +175,7 @@ def apply_and_refine(
     from magtensor.calibration.surveys.corrections import with_scatter
     from magtensor.dated import at_date_of
     from magtensor.effect_errors import taken_off
-    from magtensor.loop.stored import (
+    from magtensor.loop.correcting.stored import (
         begun_anew,
         cleaned,
         extrapolated,

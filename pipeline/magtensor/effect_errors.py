@@ -23,14 +23,14 @@ from magtensor.calibration.surveys.corrections import SurveysCalibration
 from magtensor.calibration.surveys.covariance import to_corrections, with_offset
 from magtensor.calibration.surveys.fit import frame_of
 from magtensor.calibration.types import Array, ArrayCalibration
-from magtensor.loop.another_survey import TONE
-from magtensor.loop.columns import across_directions, along_the_field
-from magtensor.loop.model import Adopted, State
-from magtensor.loop.record import record_of
-from magtensor.loop.residual import Residual
-from magtensor.loop.several import SurveysState
-from magtensor.loop.terms import REFERENCE, Terms, joined
-from magtensor.loop.waveform import NAME as HIDDEN
+from magtensor.error_models.terms import REFERENCE, Terms, joined
+from magtensor.error_models.waveform import NAME as HIDDEN
+from magtensor.loop.correcting.another_survey import TONE
+from magtensor.loop.evidence.columns import across_directions, along_the_field
+from magtensor.loop.evidence.residual import Residual
+from magtensor.loop.fitting.model import Adopted, State
+from magtensor.loop.fitting.record import record_of
+from magtensor.loop.fitting.several import SurveysState
 from magtensor.platform_frame import as_fitted
 from magtensor.survey.model import Survey, Variable
 from magtensor.tensor.uncertainty import TakenOff

@@ -15,11 +15,11 @@ from magtensor.calibration.nominal import Nominal
 from magtensor.closed_loop import STAGE, loop_document
 from magtensor.errors import MagtensorError, UsageError
 from magtensor.loop.decisions import Decision, decision_of
+from magtensor.loop.fitting.model import Fitting
 from magtensor.loop.inquiry import Inquiry, inquiry_of
-from magtensor.loop.model import Fitting
 from magtensor.loop.near_nominal import begun
-from magtensor.loop.outcome import judgement
-from magtensor.loop.unexplained import unexplained
+from magtensor.loop.searching.outcome import judgement
+from magtensor.loop.searching.unexplained import unexplained
 from magtensor.preparing import empty_survey
 from magtensor.recipe.plan import Plan, plan
 from magtensor.recipe.source import Document
@@ -350,7 +350,7 @@ def with_decisions(document: Document, decisions: Sequence[str], models: Sequenc
 
 def _try(model: Any, inquiry: Inquiry) -> None:
     """See that a model makes regressors here: one that does not would spoil the ranking of all."""
-    from magtensor.loop.profiling import settings_grid
+    from magtensor.loop.searching.profiling import settings_grid
 
     x = inquiry.first.excitation
     try:

@@ -11,7 +11,7 @@ import numpy as np
 
 from magtensor.calibration.joint_together import FALSE_REJECTION, LEAST_FOR_REJECTION
 from magtensor.calibration.types import Array, ArrayCalibration, Mask
-from magtensor.loop.waveform import free_directions
+from magtensor.error_models.waveform import free_directions
 from magtensor.survey.flags import flag_ranges
 from magtensor.survey.model import Survey
 from magtensor.tensor.geometry import array_design

@@ -7,9 +7,9 @@ from pydantic import Field
 
 from magtensor.calibration.types import Array
 from magtensor.components import error_model
-from magtensor.loop.excitation import Excitation
-from magtensor.loop.settings import Duration, EventTimes, Laws, Orders, Range
-from magtensor.loop.terms import Terms, joined
+from magtensor.error_models.excitation import Excitation
+from magtensor.error_models.settings import Duration, EventTimes, Laws, Orders, Range
+from magtensor.error_models.terms import Terms, joined
 from magtensor_effects.forms import OfField
 
 Order = Annotated[int, Orders((1, 2, 3)), Field(ge=1, le=3, description="highest power of time, or what it goes as")]

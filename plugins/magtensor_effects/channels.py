@@ -6,10 +6,10 @@ import numpy as np
 from pydantic import Field
 
 from magtensor.components import error_model
-from magtensor.loop.acting import AXES
-from magtensor.loop.excitation import Excitation
-from magtensor.loop.settings import AnyChannel, Choice, Frequencies, Range
-from magtensor.loop.terms import Terms, joined
+from magtensor.error_models.acting import AXES
+from magtensor.error_models.excitation import Excitation
+from magtensor.error_models.settings import AnyChannel, Choice, Frequencies, Range
+from magtensor.error_models.terms import Terms, joined
 from magtensor.units import convert
 from magtensor_effects.forms import AtStart, Delayed, OfField, Smooth
 

@@ -4,7 +4,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from magtensor.loop.settings import Beginning, Forms
+from magtensor.error_models.settings import Beginning, Forms
 
 Delayed = Annotated[
     bool,

@@ -8,9 +8,9 @@ from pydantic import Field
 
 from magtensor.calibration.types import Array
 from magtensor.components import error_model
-from magtensor.loop.excitation import Excitation
-from magtensor.loop.settings import Choice
-from magtensor.loop.terms import Terms, joined
+from magtensor.error_models.excitation import Excitation
+from magtensor.error_models.settings import Choice
+from magtensor.error_models.terms import Terms, joined
 from magtensor_effects.temperature import THERMOMETER, Thermometer
 
 

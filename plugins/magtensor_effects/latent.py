@@ -5,8 +5,8 @@ from typing import Annotated
 from pydantic import Field
 
 from magtensor.components import error_model
-from magtensor.loop.excitation import Excitation
-from magtensor.loop.terms import Terms
+from magtensor.error_models.excitation import Excitation
+from magtensor.error_models.terms import Terms
 
 
 @error_model(

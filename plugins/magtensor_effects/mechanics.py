@@ -8,10 +8,10 @@ from pydantic import Field
 from magtensor.attitude import into_platform
 from magtensor.calibration.types import Array
 from magtensor.components import error_model
-from magtensor.loop.acting import AXES
-from magtensor.loop.excitation import Excitation
-from magtensor.loop.settings import Orders, Range
-from magtensor.loop.terms import Terms, joined
+from magtensor.error_models.acting import AXES
+from magtensor.error_models.excitation import Excitation
+from magtensor.error_models.settings import Orders, Range
+from magtensor.error_models.terms import Terms, joined
 from magtensor.units import GRAVITY
 from magtensor_effects.ageing import EventTime, Span
 from magtensor_effects.forms import AtStart, Delayed

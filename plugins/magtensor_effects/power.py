@@ -5,9 +5,9 @@ from typing import Annotated
 from pydantic import Field
 
 from magtensor.components import error_model
-from magtensor.loop.excitation import Excitation
-from magtensor.loop.settings import AnyChannel, Range
-from magtensor.loop.terms import Terms
+from magtensor.error_models.excitation import Excitation
+from magtensor.error_models.settings import AnyChannel, Range
+from magtensor.error_models.terms import Terms
 from magtensor_effects.forms import Delayed, OfField, Smooth
 
 CURRENT = AnyChannel("current_*", or_units="A", vectors=False)

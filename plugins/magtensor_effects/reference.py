@@ -9,9 +9,9 @@ from pydantic import Field
 
 from magtensor.calibration.types import Array
 from magtensor.components import error_model
-from magtensor.loop.excitation import Excitation
-from magtensor.loop.settings import Delays
-from magtensor.loop.terms import Terms, joined
+from magtensor.error_models.excitation import Excitation
+from magtensor.error_models.settings import Delays
+from magtensor.error_models.terms import Terms, joined
 from magtensor_effects.ageing import EventTime, Law, Order, Span, courses
 
 MOST_EXCESS = 0.75  # of the recorded variation: four times that of the site

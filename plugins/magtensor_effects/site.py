@@ -11,10 +11,10 @@ from pydantic import Field
 
 from magtensor.calibration.types import Array
 from magtensor.components import error_model
-from magtensor.loop.acting import AXES
-from magtensor.loop.excitation import Excitation
-from magtensor.loop.settings import EventTimes, Orders, Range
-from magtensor.loop.terms import Terms, joined
+from magtensor.error_models.acting import AXES
+from magtensor.error_models.excitation import Excitation
+from magtensor.error_models.settings import EventTimes, Orders, Range
+from magtensor.error_models.terms import Terms, joined
 from magtensor.tensor.elements import COMPONENTS, NINE_OF_FIVE
 from magtensor.tensor.geometry import field_polynomials, term_names
 

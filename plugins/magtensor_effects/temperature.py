@@ -5,9 +5,9 @@ from typing import Annotated
 from pydantic import Field
 
 from magtensor.components import error_model
-from magtensor.loop.excitation import Excitation
-from magtensor.loop.settings import AnyChannel, Beginning, Orders, Range
-from magtensor.loop.terms import Terms, joined
+from magtensor.error_models.excitation import Excitation
+from magtensor.error_models.settings import AnyChannel, Beginning, Orders, Range
+from magtensor.error_models.terms import Terms, joined
 from magtensor_effects.forms import AtStart, Delayed, OfField
 
 THERMOMETER = AnyChannel("temperature*", or_units="degC", vectors=False)

@@ -7,9 +7,9 @@ from pydantic import Field
 
 from magtensor.calibration.types import Array
 from magtensor.components import error_model
-from magtensor.loop.excitation import Excitation
-from magtensor.loop.settings import Range
-from magtensor.loop.terms import Terms, joined
+from magtensor.error_models.excitation import Excitation
+from magtensor.error_models.settings import Range
+from magtensor.error_models.terms import Terms, joined
 from magtensor_effects.forms import OfField
 
 FULL_SCALE_NT = 50000.0  # at which the coefficients of nonlinear terms are stated

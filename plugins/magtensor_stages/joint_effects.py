@@ -15,8 +15,8 @@ from magtensor_stages import joint_surveys
 if TYPE_CHECKING:
     from magtensor.calibration.surveys.samples import Samples
     from magtensor.effect_errors import WithCoefficients
-    from magtensor.loop.model import Adopted, Record
-    from magtensor.loop.several import SurveysState
+    from magtensor.loop.fitting.model import Adopted, Record
+    from magtensor.loop.fitting.several import SurveysState
     from magtensor.survey.model import Survey
 
 Chosen = Mapping[str, tuple[Component, Mapping[str, Any]]]
@@ -43,14 +43,14 @@ class Effects:
     def variables(self, survey: Survey) -> dict[str, Any]:
         """The effects, and the joint covariance, as variables of the group `calibration`."""
         from magtensor.effect_errors import coefficient_variables
-        from magtensor.loop.stored import effect_variables
+        from magtensor.loop.correcting.stored import effect_variables
 
         own = effect_variables(self.adopted, self.theta, self.origins, survey)
         return own | coefficient_variables(self.found, survey.sensors)
 
     def cleaned(self, survey: Survey) -> Survey:
         """A survey with the effects taken off."""
-        from magtensor.loop.stored import cleaned
+        from magtensor.loop.correcting.stored import cleaned
 
         return cleaned(survey, self.found.calibration, self.adopted, self.theta, self.origins)
 
@@ -68,9 +68,9 @@ def surveys_fitted(
     Raises:
         DataError: an error model needs what a survey does not show, or makes no sense in this fit.
     """
-    from magtensor.loop.model import Adopted
-    from magtensor.loop.several import Together, surveys_state
-    from magtensor.loop.stored import begun_with, started
+    from magtensor.loop.correcting.stored import begun_with, started
+    from magtensor.loop.fitting.model import Adopted
+    from magtensor.loop.fitting.several import Together, surveys_state
 
     first = surveys[0][1]
     adopted = [Adopted(component, settings) for component, settings in chosen.values()]
@@ -86,7 +86,7 @@ def surveys_fitted(
 
 def _records(surveys: Sequence[tuple[str, Survey]], uses: Sequence[np.ndarray], measured: bool) -> list[Record]:
     """Of each survey, the origins of the first one's channels taken off all of them."""
-    from magtensor.loop.record import record_of
+    from magtensor.loop.fitting.record import record_of
 
     records = [record_of(surveys[0][1], use=uses[0])]
     for (_, one), use in zip(surveys[1:], uses[1:], strict=True):
@@ -99,7 +99,7 @@ def _records(surveys: Sequence[tuple[str, Survey]], uses: Sequence[np.ndarray], 
 
 
 def _require_sense(adopted: Sequence[Adopted], measured: bool, surveys: int) -> None:
-    from magtensor.loop.another_survey import TONE
+    from magtensor.loop.correcting.another_survey import TONE
 
     for one in adopted:
         if one.component.effect == "reference" and not measured:
@@ -109,7 +109,7 @@ def _require_sense(adopted: Sequence[Adopted], measured: bool, surveys: int) -> 
 
 
 def _require_needs(adopted: Sequence[Adopted], record: Record, where: str) -> None:
-    from magtensor.loop.needs import missing
+    from magtensor.error_models.needs import missing
 
     for one in adopted:
         if lacking := missing(one.component, record.excitation(record.raw, record.raw)):

@@ -75,7 +75,7 @@ def samples_of(survey: Survey, use: np.ndarray, field: Field) -> Samples:
     """The samples of one survey; a total field that is not known is the size of the raw outputs."""
     from magtensor.attitude import into_platform
     from magtensor.calibration.surveys.samples import Samples
-    from magtensor.loop.record import runs
+    from magtensor.loop.fitting.record import runs
 
     raw = np.asarray(survey.values("b_raw"), dtype=float)[use]
     segment = np.asarray(survey.values("segment"), dtype=int) if "segment" in survey else np.zeros(len(use), dtype=int)

@@ -68,16 +68,16 @@ def close_loop(
     from magtensor.calibration.joint import calibrated
     from magtensor.calibration.nominal import Nominal
     from magtensor.effect_errors import coefficient_variables, with_coefficients
-    from magtensor.loop.correction import as_elsewhere
+    from magtensor.loop.correcting.correction import as_elsewhere
+    from magtensor.loop.correcting.stored import cleaned, effect_variables
     from magtensor.loop.decisions import Decision, decision_of
-    from magtensor.loop.errors_before_after import folds_for, held_out_error
+    from magtensor.loop.evidence.own_noise import OwnNoise
+    from magtensor.loop.fitting.errors_before_after import folds_for, held_out_error
+    from magtensor.loop.fitting.model import Fitting
+    from magtensor.loop.fitting.refit import with_colour
     from magtensor.loop.inquiry import inquiry_of
-    from magtensor.loop.model import Fitting
     from magtensor.loop.near_nominal import doubt_of, labelled, settled
-    from magtensor.loop.own_noise import OwnNoise
-    from magtensor.loop.refit import with_colour
-    from magtensor.loop.stored import cleaned, effect_variables
-    from magtensor.loop.unexplained import unexplained
+    from magtensor.loop.searching.unexplained import unexplained
     from magtensor.tensors import slow_noise_variables
 
     def inquired(how: Fitting) -> Inquiry:

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from magtensor.loop.excitation import Excitation
-from magtensor.loop.terms import Terms
+from magtensor.error_models.excitation import Excitation
+from magtensor.error_models.terms import Terms
 from magtensor.simulate import simulate
 from magtensor.simulate.run import Simulated
 

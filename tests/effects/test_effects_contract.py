@@ -10,10 +10,10 @@ import pytest
 
 import magtensor_effects
 from magtensor.components import Component, component_of, error_model
+from magtensor.error_models.example import example_survey
+from magtensor.error_models.needs import missing
+from magtensor.error_models.settings import Range
 from magtensor.loop.checker import check_error_model
-from magtensor.loop.example import example_survey
-from magtensor.loop.needs import missing
-from magtensor.loop.settings import Range
 from magtensor.registry import Registry
 
 # DESIGN section 5, without the base model `linear`; its several steps of an offset are also one that goes back.
@@ -135,7 +135,7 @@ def test_regressors_take_no_noise_from_the_raw_data() -> None:
     # they may look at the modelled outputs only: Excitation does not hold the recorded ones
     from dataclasses import fields
 
-    from magtensor.loop.excitation import Excitation
+    from magtensor.error_models.excitation import Excitation
 
     assert not {"raw", "b_raw"} & {f.name for f in fields(Excitation)}
 
@@ -154,7 +154,7 @@ def of_sensors(x):
 @error_model("instrument", source="nowhere", typical="1 nT")
 def repeated(x):
     """The same regressor twice."""
-    from magtensor.loop.terms import joined
+    from magtensor.error_models.terms import joined
 
     return joined([x.offsets(x.elapsed, "nT/s"), x.offsets(2 * x.elapsed, "nT/s", "again ")])
 

@@ -28,7 +28,7 @@ from effect_cases import (
 
 import magtensor_effects
 from magtensor.components import Component, component_of
-from magtensor.loop.excitation import Excitation
+from magtensor.error_models.excitation import Excitation
 from magtensor.simulate.run import Simulated
 
 SPAN_S = 179.9  # of the tumbling survey

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from effect_cases import Array, excitation, simulated
 
-from magtensor.loop.excitation import Excitation
+from magtensor.error_models.excitation import Excitation
 
 
 def bare(time: Array, run: Array | None = None) -> Excitation:

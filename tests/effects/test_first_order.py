@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from magtensor.loop import first_order
+from magtensor.error_models import first_order
 
 TIME = np.cumsum(np.random.default_rng(3).uniform(0.05, 0.15, 200))
 

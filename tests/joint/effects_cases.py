@@ -14,8 +14,8 @@ from magtensor.calibration.surveys.corrections import calibrated_surveys
 from magtensor.calibration.surveys.samples import Samples
 from magtensor.components import component_of
 from magtensor.effect_errors import SurveysWithCoefficients, surveys_with_coefficients
-from magtensor.loop.model import Adopted, Record
-from magtensor.loop.several import SurveysState, Together, surveys_state
+from magtensor.loop.fitting.model import Adopted, Record
+from magtensor.loop.fitting.several import SurveysState, Together, surveys_state
 from magtensor_effects import temperature
 
 Model = Callable[..., Any]

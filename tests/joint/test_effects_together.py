@@ -26,9 +26,9 @@ from magtensor.calibration.surveys.fit import fit_surveys
 from magtensor.components import component_of
 from magtensor.effect_errors import WithCoefficients, with_coefficients
 from magtensor.errors import DataError
-from magtensor.loop.model import Adopted, Fitting
-from magtensor.loop.refit import joint_state
-from magtensor.loop.several import Together, surveys_state
+from magtensor.loop.fitting.model import Adopted, Fitting
+from magtensor.loop.fitting.refit import joint_state
+from magtensor.loop.fitting.several import Together, surveys_state
 from magtensor_effects.temperature import temperature_offset, temperature_scale
 
 FITS = 12

@@ -15,9 +15,9 @@ from magtensor.calibration.joint import calibrated, fit_joint, nearest_frame
 from magtensor.cli import status_of
 from magtensor.components import component_of
 from magtensor.effect_errors import COVARIANCE, WithCoefficients, with_coefficients
-from magtensor.loop.model import Adopted, Fitting, State
-from magtensor.loop.record import record_of
-from magtensor.loop.refit import joint_state
+from magtensor.loop.fitting.model import Adopted, Fitting, State
+from magtensor.loop.fitting.record import record_of
+from magtensor.loop.fitting.refit import joint_state
 from magtensor.preparing import empty_survey
 from magtensor.recipe.plan import read_plan
 from magtensor.session import compute

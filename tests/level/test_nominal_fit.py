@@ -13,7 +13,7 @@ from magtensor.calibration.joint import calibrated, fit_joint, nearest_frame
 from magtensor.calibration.nominal import Nominal, _Data, fit_nominal
 from magtensor.calibration.types import Array
 from magtensor.errors import DataError, NotEnoughData
-from magtensor.loop.residual import residual_of
+from magtensor.loop.evidence.residual import residual_of
 
 
 @pytest.mark.parametrize("sensors", [1, 2, 4])

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from magtensor.loop.model import Fitting, Record, State
-from magtensor.loop.record import record_of
-from magtensor.loop.refit import joint_state
-from magtensor.loop.settings import EventTimes, profiled
+from magtensor.error_models.settings import EventTimes, profiled
+from magtensor.loop.fitting.model import Fitting, Record, State
+from magtensor.loop.fitting.record import record_of
+from magtensor.loop.fitting.refit import joint_state
 from magtensor.preparing import empty_survey, load_as
 from magtensor.recipe.plan import read_plan
 from magtensor.registry import Registry

@@ -14,9 +14,9 @@ from loop_cases import Array, linear_state, scenario, survey_file, synthetic
 from scipy.signal import lfilter
 
 import magtensor
-from magtensor.loop.model import Adopted, Fitting
-from magtensor.loop.refit import joint_state
-from magtensor.loop.wandering import narrowed_to, of_sensors, quieter, unweighed
+from magtensor.loop.fitting.model import Adopted, Fitting
+from magtensor.loop.fitting.refit import joint_state
+from magtensor.loop.fitting.wandering import narrowed_to, of_sensors, quieter, unweighed
 from magtensor.registry import Registry
 
 

@@ -6,8 +6,8 @@ import numpy as np
 from loop_cases import linear_state, synthetic
 from scipy.fft import prev_fast_len
 
-from magtensor.loop.latent import sought, tried_source
-from magtensor.loop.model import Fitting
+from magtensor.loop.fitting.model import Fitting
+from magtensor.loop.searching.latent import sought, tried_source
 from magtensor.registry import Registry
 
 PRIME = 5987  # samples

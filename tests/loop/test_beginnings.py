@@ -11,7 +11,7 @@ import pytest
 from loop_cases import BASE, lasting_effects, scenario, survey_file, verdict_of
 
 from magtensor import close_loop
-from magtensor.loop.example import example_survey
+from magtensor.error_models.example import example_survey
 from magtensor.registry import Registry
 
 TAU_S = 150.0

@@ -10,10 +10,10 @@ import pytest
 from loop_cases import BASE, RECIPE, adopted_names, scenario, survey_file, verdict_of
 from scipy.spatial.transform import Rotation
 
-from magtensor.loop.model import Adopted, Fitting, Record
-from magtensor.loop.record import record_of
-from magtensor.loop.refit import joint_state
-from magtensor.loop.seen import beside_the_site
+from magtensor.loop.fitting.model import Adopted, Fitting, Record
+from magtensor.loop.fitting.record import record_of
+from magtensor.loop.fitting.refit import joint_state
+from magtensor.loop.fitting.seen import beside_the_site
 from magtensor.preparing import load_as
 from magtensor.recipe.plan import read_plan
 from magtensor.registry import Registry

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from loop_cases import Array, linear_state, synthetic
 
-from magtensor.loop.changing_matrix import changing_matrices
-from magtensor.loop.model import Fitting, Record
-from magtensor.loop.search import search
-from magtensor.loop.unexplained import NOISE, unexplained
+from magtensor.loop.fitting.model import Fitting, Record
+from magtensor.loop.remainder.changing_matrix import changing_matrices
+from magtensor.loop.searching.search import search
+from magtensor.loop.searching.unexplained import NOISE, unexplained
 from magtensor.registry import Registry
 
 ALPHA = 0.001

@@ -13,11 +13,11 @@ from loop_cases import BASE, adopted_names, scenario, verdict_of
 from numpy.typing import NDArray
 from scipy.fft import idct
 
-from magtensor.loop.colour import colour_of
-from magtensor.loop.course_of_time import FIRST_LEFT
-from magtensor.loop.example import example_survey
-from magtensor.loop.separation import plainer
-from magtensor.loop.settings import profiled
+from magtensor.error_models.example import example_survey
+from magtensor.error_models.settings import profiled
+from magtensor.loop.evidence.colour import colour_of
+from magtensor.loop.fitting.separation import plainer
+from magtensor.loop.searching.course_of_time import FIRST_LEFT
 from magtensor.registry import Registry
 from magtensor_effects.ageing import courses
 

@@ -11,7 +11,7 @@ import pytest
 from loop_cases import adopted_names, scenario, survey_file, verdict_of
 
 import magtensor
-from magtensor.loop.delays import on_time, unseen
+from magtensor.error_models.delays import on_time, unseen
 from magtensor.simulate import simulate, write
 
 NOISE_NT = 0.15

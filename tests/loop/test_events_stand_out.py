@@ -10,11 +10,11 @@ import pytest
 from loop_cases import Array, linear_state, synthetic
 from scipy.signal import lfilter
 
-from magtensor.loop.gates import ALPHA, Candidate
-from magtensor.loop.model import Record
-from magtensor.loop.outcome import why
-from magtensor.loop.rounds import with_lines
-from magtensor.loop.screening import candidates_of
+from magtensor.loop.fitting.model import Record
+from magtensor.loop.searching.gates import ALPHA, Candidate
+from magtensor.loop.searching.outcome import why
+from magtensor.loop.searching.rounds import with_lines
+from magtensor.loop.searching.screening import candidates_of
 from magtensor.registry import Registry
 
 EVENTS = ("reference_step", "passing_source", "scale_step")

@@ -176,7 +176,7 @@ def constant(x):
 PARTLY = '''"""Half of it a constant."""
 import numpy as np
 from magtensor import error_model
-from magtensor.loop.terms import joined
+from magtensor.error_models.terms import joined
 
 
 @error_model("instrument", needs=("current_heater",), source="diagram", typical="nT")

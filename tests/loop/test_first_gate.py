@@ -10,14 +10,14 @@ import pytest
 from loop_cases import Array, linear_state, synthetic
 from scipy.special import chdtrc, chdtri
 
-from magtensor.loop.assessment import BORNE_OUT, assess, estimated_in, explained, slow_noise_of
-from magtensor.loop.evidence import Whitened
-from magtensor.loop.gates import ALPHA, Candidate
-from magtensor.loop.model import Adopted
-from magtensor.loop.outcome import why
-from magtensor.loop.rounds import with_lines
-from magtensor.loop.screening import candidates_of
-from magtensor.loop.terms import Terms
+from magtensor.error_models.terms import Terms
+from magtensor.loop.evidence.assessment import BORNE_OUT, assess, estimated_in, explained, slow_noise_of
+from magtensor.loop.evidence.grams import Whitened
+from magtensor.loop.fitting.model import Adopted
+from magtensor.loop.searching.gates import ALPHA, Candidate
+from magtensor.loop.searching.outcome import why
+from magtensor.loop.searching.rounds import with_lines
+from magtensor.loop.searching.screening import candidates_of
 from magtensor.registry import Registry
 
 MODELS = ("turn_step", "scale_drift", "nonlinearity_cubic", "eddy_current")

@@ -11,7 +11,7 @@ import pytest
 from loop_cases import linear_state, loaded, scenario, synthetic
 from numpy.typing import NDArray
 
-from magtensor.loop.gradient_shape import gradient_share
+from magtensor.loop.remainder.gradient_shape import gradient_share
 
 Array = NDArray[np.float64]
 CROSS = np.array([[0.3, 0, 0], [-0.3, 0, 0], [0, 0.3, 0], [0, -0.3, 0]])

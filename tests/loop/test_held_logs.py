@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from loop_cases import scenario, verdict_of
 
-from magtensor.loop.held_logs import unheld
+from magtensor.error_models.held_logs import unheld
 
 HELD = 60  # samples of half a second
 TIME = np.arange(3000) * 0.5

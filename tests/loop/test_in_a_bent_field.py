@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from loop_cases import Array
 
-from magtensor.loop.waveform import bends, course_of
+from magtensor.error_models.waveform import bends, course_of
 from magtensor.tensor.geometry import array_design
 
 CROSS = 0.25 * np.array([[1.0, 0, 0], [0, 1.0, 0], [-1.0, 0, 0], [0, -1.0, 0]])

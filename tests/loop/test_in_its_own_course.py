@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from loop_cases import RECIPE, Array, linear_state, scenario, survey_file
 
-from magtensor.loop.beginnings import begun
-from magtensor.loop.model import State
-from magtensor.loop.profiling import REFINING_SAMPLES, thinned
-from magtensor.loop.record import record_of
+from magtensor.loop.fitting.model import State
+from magtensor.loop.fitting.record import record_of
+from magtensor.loop.searching.beginnings import begun
+from magtensor.loop.searching.profiling import REFINING_SAMPLES, thinned
 from magtensor.preparing import load_as
 from magtensor.recipe.plan import read_plan
 from magtensor.registry import Registry

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from loop_cases import linear_state, loaded, scenario
 
-from magtensor.loop.jitter import jitter_words
+from magtensor.loop.remainder.jitter import jitter_words
 
 EFFECTS: dict[str, list[dict[str, Any]]] = {
     "clean": [],

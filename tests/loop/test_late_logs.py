@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from loop_cases import scenario, suspects, verdict_of
 
-from magtensor.loop.settings import Range
+from magtensor.error_models.settings import Range
 
 LATE = 3  # samples of half a second
 

@@ -10,17 +10,17 @@ from loop_cases import Array, synthetic
 
 from magtensor.calibration.joint import fit_joint
 from magtensor.components import component_of, error_model
-from magtensor.loop.assessment import Colours, colours_of, estimated, explained
-from magtensor.loop.colour import Colour
-from magtensor.loop.evidence import grams, held_out, normal
-from magtensor.loop.excitation import Excitation
-from magtensor.loop.model import Fitting, Record
-from magtensor.loop.residual import Residual, residual_of, taken_off
-from magtensor.loop.scoring import Scorer, rarity
-from magtensor.loop.search import search
-from magtensor.loop.seen import excitation_of
-from magtensor.loop.statistics import own_information, solve
-from magtensor.loop.terms import REFERENCE, Terms, joined
+from magtensor.error_models.excitation import Excitation
+from magtensor.error_models.terms import REFERENCE, Terms, joined
+from magtensor.loop.evidence.assessment import Colours, colours_of, estimated, explained
+from magtensor.loop.evidence.colour import Colour
+from magtensor.loop.evidence.grams import grams, held_out, normal
+from magtensor.loop.evidence.residual import Residual, residual_of, taken_off
+from magtensor.loop.evidence.scoring import Scorer, rarity
+from magtensor.loop.evidence.statistics import own_information, solve
+from magtensor.loop.fitting.model import Fitting, Record
+from magtensor.loop.fitting.seen import excitation_of
+from magtensor.loop.searching.search import search
 
 WHITE = Colour(None, 1.0)
 

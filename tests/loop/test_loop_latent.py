@@ -10,13 +10,13 @@ from loop_cases import Array, linear_state, synthetic
 from scipy.stats import kstest
 
 from magtensor.calibration.types import ArrayCalibration
-from magtensor.loop.correction import corrected_raw, hidden_waveform
-from magtensor.loop.factor import noise_alone, with_factor
-from magtensor.loop.latent import ALPHA, shared_words, sought, tried_source
-from magtensor.loop.model import Adopted, Fitting, Record
-from magtensor.loop.refit import joint_state
-from magtensor.loop.switching import two_levels
-from magtensor.loop.waveform import course_of, free_directions
+from magtensor.error_models.switching import two_levels
+from magtensor.error_models.waveform import course_of, free_directions
+from magtensor.loop.correcting.correction import corrected_raw, hidden_waveform
+from magtensor.loop.evidence.factor import noise_alone, with_factor
+from magtensor.loop.fitting.model import Adopted, Fitting, Record
+from magtensor.loop.fitting.refit import joint_state
+from magtensor.loop.searching.latent import ALPHA, shared_words, sought, tried_source
 from magtensor.registry import Registry
 from magtensor.tensor.geometry import array_design, standard_geometry
 

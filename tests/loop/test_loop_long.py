@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from loop_cases import BASE, loaded, scenario
 
-from magtensor.loop.found import Search
+from magtensor.loop.fitting.model import Fitting
+from magtensor.loop.fitting.refit import joint_state
 from magtensor.loop.long_record import on_every_sample, part_of
-from magtensor.loop.model import Fitting
-from magtensor.loop.refit import joint_state
-from magtensor.loop.search import search
-from magtensor.loop.unexplained import unexplained
+from magtensor.loop.searching.found import Search
+from magtensor.loop.searching.search import search
+from magtensor.loop.searching.unexplained import unexplained
 from magtensor.registry import Registry
 
 HOW = Fitting()

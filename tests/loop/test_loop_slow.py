@@ -14,14 +14,14 @@ from scipy.signal import lfilter
 from scipy.stats import norm
 
 from magtensor.calibration.joint import calibrated
-from magtensor.loop.colour import Colour, colour_of
-from magtensor.loop.correction import corrected_raw
-from magtensor.loop.model import Adopted, Fitting
-from magtensor.loop.multiplicity import effective_tests
-from magtensor.loop.refit import joint_state
-from magtensor.loop.scoring import rarity
-from magtensor.loop.smoothing import smoothed
-from magtensor.loop.turned import SlowModes, TurnedColour, excess_of, excess_of_one
+from magtensor.error_models.smoothing import smoothed
+from magtensor.loop.correcting.correction import corrected_raw
+from magtensor.loop.evidence.colour import Colour, colour_of
+from magtensor.loop.evidence.multiplicity import effective_tests
+from magtensor.loop.evidence.scoring import rarity
+from magtensor.loop.evidence.turned import SlowModes, TurnedColour, excess_of, excess_of_one
+from magtensor.loop.fitting.model import Adopted, Fitting
+from magtensor.loop.fitting.refit import joint_state
 from magtensor.registry import Registry
 
 Array = NDArray[np.float64]

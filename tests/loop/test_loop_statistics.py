@@ -9,15 +9,15 @@ import pytest
 from loop_cases import Array, linear_state, synthetic
 from scipy.stats import kstest
 
-from magtensor.loop.assessment import block_count, colours_of
-from magtensor.loop.colour import Colour, colour_of
-from magtensor.loop.evidence import grams
-from magtensor.loop.gates import ALPHA
-from magtensor.loop.model import Record, State
-from magtensor.loop.quiet import quieted
-from magtensor.loop.record import CLEARANCE
-from magtensor.loop.spectrum import spectral_lines
-from magtensor.loop.statistics import Gain, cauchy_combination, family_p, wald_p
+from magtensor.error_models.quiet import quieted
+from magtensor.loop.evidence.assessment import block_count, colours_of
+from magtensor.loop.evidence.colour import Colour, colour_of
+from magtensor.loop.evidence.grams import grams
+from magtensor.loop.evidence.spectrum import spectral_lines
+from magtensor.loop.evidence.statistics import Gain, cauchy_combination, family_p, wald_p
+from magtensor.loop.fitting.model import Record, State
+from magtensor.loop.fitting.record import CLEARANCE
+from magtensor.loop.searching.gates import ALPHA
 
 WHITE = Colour(None, 1.0)
 

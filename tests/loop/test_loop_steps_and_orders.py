@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from loop_cases import linear_state, loaded, scenario, synthetic
 
-from magtensor.loop.found import Search
-from magtensor.loop.model import Fitting
-from magtensor.loop.search import search
+from magtensor.loop.fitting.model import Fitting
+from magtensor.loop.searching.found import Search
+from magtensor.loop.searching.search import search
 from magtensor.registry import Registry
 
 SAMPLES = 300

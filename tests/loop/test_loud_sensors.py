@@ -10,10 +10,10 @@ import xarray as xr
 from loop_cases import linear_state, scenario, survey_file, synthetic, verdict_of
 
 import magtensor
-from magtensor.loop.contribution import eliminate, removal
-from magtensor.loop.model import Adopted, Fitting
-from magtensor.loop.refit import joint_state
-from magtensor.loop.statistics import symmetric_eigen
+from magtensor.loop.evidence.statistics import symmetric_eigen
+from magtensor.loop.fitting.model import Adopted, Fitting
+from magtensor.loop.fitting.refit import joint_state
+from magtensor.loop.searching.contribution import eliminate, removal
 from magtensor.registry import Registry
 
 OF_THE_FIELD = ["hysteresis", "bandwidth", "viscous_magnetisation", "nonlinearity_cubic", "scale_step", "cross_field"]

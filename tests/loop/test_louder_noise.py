@@ -8,7 +8,7 @@ import h5py
 import numpy as np
 from loop_cases import scenario, verdict_of
 
-from magtensor.loop.stretches import louder_in
+from magtensor.loop.evidence.stretches import louder_in
 
 MODELS = ["offset_step", "passing_source", "eddy_current", "temperature_offset", "offset_drift", "scale_step"]
 

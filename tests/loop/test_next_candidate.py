@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from loop_cases import BASE, adopted_names, lasting_effects, linear_state, scenario, synthetic, verdict_of
 
-from magtensor.loop import by_hand, rivals, rounds
-from magtensor.loop.course_of_time import BesideTime
-from magtensor.loop.gates import ALPHA
-from magtensor.loop.model import Adopted, Fitting, Record, State
-from magtensor.loop.terms import Terms
+from magtensor.error_models.terms import Terms
+from magtensor.loop.fitting.model import Adopted, Fitting, Record, State
+from magtensor.loop.searching import by_hand, rivals, rounds
+from magtensor.loop.searching.course_of_time import BesideTime
+from magtensor.loop.searching.gates import ALPHA
 from magtensor.registry import Registry
 
 EFFECTS = ({"type": "temperature_offset", "rms_nT": 1.0}, {"type": "nonlinearity_cubic", "rms_nT": 0.6})

@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 from loop_cases import Array, adopted_names, linear_state, scenario, synthetic, verdict_of
 
-from magtensor.loop.errors_before_after import folds_for
-from magtensor.loop.gates import OF_THE_LAW, Candidate, adds_to_axes
-from magtensor.loop.kin import drivers, explained_by_kin
-from magtensor.loop.model import Adopted, Fitting, Record, State
-from magtensor.loop.refit import joint_state
+from magtensor.loop.fitting.errors_before_after import folds_for
+from magtensor.loop.fitting.model import Adopted, Fitting, Record, State
+from magtensor.loop.fitting.refit import joint_state
+from magtensor.loop.searching.gates import OF_THE_LAW, Candidate, adds_to_axes
+from magtensor.loop.searching.kin import drivers, explained_by_kin
 from magtensor.registry import Registry
 
 COURSE = np.sin(np.arange(1200) / 200.0)

@@ -10,7 +10,7 @@ import pytest
 from loop_cases import BASE, adopted_names, scenario, suspects, verdict_of
 from scipy.stats import ncx2
 
-from magtensor.loop.gates import gained_of_a_log
+from magtensor.loop.searching.gates import gained_of_a_log
 
 
 @pytest.mark.parametrize("log_noise", [1.0, 30.0, 300.0])

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from loop_cases import BASE, Array, scenario, synthetic, verdict_of
 
-from magtensor.loop.assessment import estimated
-from magtensor.loop.model import Adopted, Fitting, Record
-from magtensor.loop.refit import joint_state
-from magtensor.loop.terms import joined
+from magtensor.error_models.terms import joined
+from magtensor.loop.evidence.assessment import estimated
+from magtensor.loop.fitting.model import Adopted, Fitting, Record
+from magtensor.loop.fitting.refit import joint_state
 from magtensor.registry import Registry
 
 NOISE_NT = (150.0, 550.0)

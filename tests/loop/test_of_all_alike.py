@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from loop_cases import scenario, synthetic, verdict_of
 
-from magtensor.loop.contribution import of_all_alike
-from magtensor.loop.model import Adopted, Fitting
-from magtensor.loop.refit import joint_state
+from magtensor.loop.fitting.model import Adopted, Fitting
+from magtensor.loop.fitting.refit import joint_state
+from magtensor.loop.searching.contribution import of_all_alike
 from magtensor.registry import Registry
 
 FOLLOWING = ["temperature_scale", "temperature_offset", "channel_response"]

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from loop_cases import Array, synthetic
 
-from magtensor.loop.adopting import on_those_that_show
-from magtensor.loop.model import Adopted, Fitting, Record
-from magtensor.loop.outcome import judgement
-from magtensor.loop.record import origin
-from magtensor.loop.refit import joint_state
-from magtensor.loop.rounds import with_lines
-from magtensor.loop.screening import candidates_of
-from magtensor.loop.search import search
+from magtensor.loop.fitting.model import Adopted, Fitting, Record
+from magtensor.loop.fitting.record import origin
+from magtensor.loop.fitting.refit import joint_state
+from magtensor.loop.searching.adopting import on_those_that_show
+from magtensor.loop.searching.outcome import judgement
+from magtensor.loop.searching.rounds import with_lines
+from magtensor.loop.searching.screening import candidates_of
+from magtensor.loop.searching.search import search
 from magtensor.registry import Registry
 
 SAMPLES = 1500

@@ -12,11 +12,11 @@ import pytest
 from loop_cases import BASE, adopted_names, loaded, scenario, verdict_of
 from scipy.signal import lfilter
 
-from magtensor.loop import rounds, search
-from magtensor.loop.found import Search
-from magtensor.loop.model import Adopted, Fitting
-from magtensor.loop.overshadowed import attitude_share
-from magtensor.loop.refit import joint_state
+from magtensor.loop.fitting.model import Adopted, Fitting
+from magtensor.loop.fitting.refit import joint_state
+from magtensor.loop.searching import rounds, search
+from magtensor.loop.searching.found import Search
+from magtensor.loop.searching.overshadowed import attitude_share
 from magtensor.registry import Registry
 
 MODELS = ("nonlinearity_quadratic", "nonlinearity_cubic", "current_field", "site_gradient")

@@ -10,15 +10,15 @@ import pytest
 from loop_cases import Array, linear_state, synthetic
 from scipy.signal import lfilter
 
-from magtensor.loop.assessment import block_count
-from magtensor.loop.colour import colour_of
-from magtensor.loop.evidence import grams
-from magtensor.loop.gates import ALPHA, Candidate
-from magtensor.loop.model import State
-from magtensor.loop.own_noise import OwnNoise, smoothed_spectrum
-from magtensor.loop.rounds import with_lines
-from magtensor.loop.screening import candidates_of
-from magtensor.loop.statistics import family_p
+from magtensor.loop.evidence.assessment import block_count
+from magtensor.loop.evidence.colour import colour_of
+from magtensor.loop.evidence.grams import grams
+from magtensor.loop.evidence.own_noise import OwnNoise, smoothed_spectrum
+from magtensor.loop.evidence.statistics import family_p
+from magtensor.loop.fitting.model import State
+from magtensor.loop.searching.gates import ALPHA, Candidate
+from magtensor.loop.searching.rounds import with_lines
+from magtensor.loop.searching.screening import candidates_of
 from magtensor.registry import Registry
 
 SAMPLES = 1500

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from loop_cases import synthetic
 
-from magtensor.loop.contribution import share_of_the_field
-from magtensor.loop.model import Adopted, Fitting
-from magtensor.loop.refit import joint_state
+from magtensor.loop.fitting.model import Adopted, Fitting
+from magtensor.loop.fitting.refit import joint_state
+from magtensor.loop.searching.contribution import share_of_the_field
 from magtensor.registry import Registry
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from loop_cases import linear_state, synthetic
 
-from magtensor.loop.needs import missing
+from magtensor.error_models.needs import missing
 from magtensor.registry import Registry
 
 

@@ -12,8 +12,8 @@ import pytest
 from loop_cases import BASE, Array, adopted_names, scenario, verdict_of
 from scipy.integrate import solve_ivp
 
-from magtensor.loop.model import Adopted
-from magtensor.loop.profiling import already
+from magtensor.loop.fitting.model import Adopted
+from magtensor.loop.searching.profiling import already
 from magtensor.registry import Registry
 
 THERMAL = ("temperature_offset", "temperature_rate", "offset_drift", "warm_up")

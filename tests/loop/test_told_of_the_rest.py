@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from loop_cases import Array, linear_state, synthetic
 
-from magtensor.loop.found import Search
-from magtensor.loop.model import Fitting, Record
-from magtensor.loop.predictable import converter_words
-from magtensor.loop.unexplained import loud_words, unexplained
+from magtensor.loop.fitting.model import Fitting, Record
+from magtensor.loop.remainder.predictable import converter_words
+from magtensor.loop.searching.found import Search
+from magtensor.loop.searching.unexplained import loud_words, unexplained
 from magtensor.verdict import sentence
 
 SAMPLES = 3000

@@ -11,10 +11,10 @@ import pytest
 from loop_cases import BASE, Array, adopted_names, loaded, scenario, verdict_of
 from scipy.spatial.transform import Rotation
 
-from magtensor.loop.direction import turning_Hz
-from magtensor.loop.model import Adopted, Fitting
-from magtensor.loop.overshadowed import _of_the_attitude
-from magtensor.loop.refit import joint_state
+from magtensor.error_models.direction import turning_Hz
+from magtensor.loop.fitting.model import Adopted, Fitting
+from magtensor.loop.fitting.refit import joint_state
+from magtensor.loop.searching.overshadowed import _of_the_attitude
 from magtensor.registry import Registry
 
 RATES = 2 * np.pi / 40.0 * np.array([1.0, 0.61, 0.37])  # rad/s about z, y and x

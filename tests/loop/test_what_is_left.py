@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from loop_cases import Array, linear_state, synthetic
 
-from magtensor.loop.latent import Sought
-from magtensor.loop.model import Fitting
-from magtensor.loop.predictable import predictable_in_the_total_field
-from magtensor.loop.search import search
-from magtensor.loop.statistics import Gain
-from magtensor.loop.unexplained import NOISE, unexplained
+from magtensor.loop.evidence.statistics import Gain
+from magtensor.loop.fitting.model import Fitting
+from magtensor.loop.remainder.predictable import predictable_in_the_total_field
+from magtensor.loop.searching.latent import Sought
+from magtensor.loop.searching.search import search
+from magtensor.loop.searching.unexplained import NOISE, unexplained
 
 
 def cubed(raw: Array) -> Array:

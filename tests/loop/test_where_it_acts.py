@@ -10,15 +10,15 @@ import pytest
 from loop_cases import BASE, Array, adopted_names, linear_state, scenario, synthetic, verdict_of
 
 from magtensor.components import Component
-from magtensor.loop.assessment import WHITE
-from magtensor.loop.errors_before_after import folds_for
-from magtensor.loop.evidence import grams
-from magtensor.loop.gates import ALPHA, SECOND_ORDER, Candidate
-from magtensor.loop.model import Adopted, Fitting, Record
-from magtensor.loop.outcome import why
-from magtensor.loop.refit import joint_state
-from magtensor.loop.screening import candidates_of
-from magtensor.loop.statistics import LEAST_T, focused_folds
+from magtensor.loop.evidence.assessment import WHITE
+from magtensor.loop.evidence.grams import grams
+from magtensor.loop.evidence.statistics import LEAST_T, focused_folds
+from magtensor.loop.fitting.errors_before_after import folds_for
+from magtensor.loop.fitting.model import Adopted, Fitting, Record
+from magtensor.loop.fitting.refit import joint_state
+from magtensor.loop.searching.gates import ALPHA, SECOND_ORDER, Candidate
+from magtensor.loop.searching.outcome import why
+from magtensor.loop.searching.screening import candidates_of
 from magtensor.registry import Registry
 
 SAMPLES = 1200  # one a second

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from loop_cases import linear_state, loaded, scenario
 
-from magtensor.loop.by_hand import candidate
-from magtensor.loop.gates import ALPHA, Candidate
-from magtensor.loop.model import Record, State
-from magtensor.loop.which_channel import nearest
+from magtensor.loop.fitting.model import Record, State
+from magtensor.loop.searching.by_hand import candidate
+from magtensor.loop.searching.gates import ALPHA, Candidate
+from magtensor.loop.searching.which_channel import nearest
 from magtensor.registry import Registry
 
 MODEL = "temperature_offset"

@@ -18,14 +18,14 @@ import numpy as np
 
 from magtensor.calibration.types import Array, ArrayCalibration
 from magtensor.components import Component, PluginError, component_of
-from magtensor.loop.correction import corrected_raw
-from magtensor.loop.delays import cleared
-from magtensor.loop.example import example_survey
-from magtensor.loop.excitation import Excitation
-from magtensor.loop.model import Adopted, Record
-from magtensor.loop.needs import FACTS, missing
-from magtensor.loop.settings import AnyChannel, Choice, EventTimes, Range, profiled
-from magtensor.loop.terms import REFERENCE, Terms
+from magtensor.error_models.delays import cleared
+from magtensor.error_models.example import example_survey
+from magtensor.error_models.excitation import Excitation
+from magtensor.error_models.needs import FACTS, missing
+from magtensor.error_models.settings import AnyChannel, Choice, EventTimes, Range, profiled
+from magtensor.error_models.terms import REFERENCE, Terms
+from magtensor.loop.correcting.correction import corrected_raw
+from magtensor.loop.fitting.model import Adopted, Record
 
 TRIED = 24  # combinations of settings at most
 APART = 0.1  # of the survey, by which two times of one model differ: between them is more than a sample
@@ -153,7 +153,7 @@ def _regressors(component: Component, x: Excitation, settings: Mapping[str, Any]
     except Exception as error:  # whatever a stranger's code raises is told, not passed on
         return [f"{type(error).__name__}: {error}"]
     if not isinstance(terms, Terms):
-        return [f"gives {type(terms).__name__}; magtensor.loop.terms.Terms would be right"]
+        return [f"gives {type(terms).__name__}; magtensor.error_models.terms.Terms would be right"]
     found = _shape(terms, x)
     if found:
         return found

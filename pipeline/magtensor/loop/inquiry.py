@@ -12,25 +12,25 @@ from typing import Any
 from magtensor.calibration.joint import calibrated
 from magtensor.calibration.types import Array
 from magtensor.components import Component
+from magtensor.error_models.needs import missing
 from magtensor.errors import DataError, NotEnoughData, UsageError, did_you_mean
-from magtensor.loop import by_hand
-from magtensor.loop.by_hand import ByHand
 from magtensor.loop.decisions import Decision
-from magtensor.loop.found import Search, Step
-from magtensor.loop.gates import Candidate
-from magtensor.loop.latent import NAME, sought
+from magtensor.loop.fitting.model import Adopted, Fitting, Record, State
+from magtensor.loop.fitting.record import record_of
+from magtensor.loop.fitting.refit import joint_state, without
+from magtensor.loop.fitting.wandering import unweighed
 from magtensor.loop.long_record import on_every_sample, part_of
-from magtensor.loop.model import Adopted, Fitting, Record, State
-from magtensor.loop.needs import missing
-from magtensor.loop.outcome import described
-from magtensor.loop.own_fit import at_their_own_fit
-from magtensor.loop.profiling import repeatable
-from magtensor.loop.record import record_of
-from magtensor.loop.refit import joint_state, without
-from magtensor.loop.rounds import with_lines
-from magtensor.loop.screening import candidates_of
-from magtensor.loop.search import search
-from magtensor.loop.wandering import unweighed
+from magtensor.loop.searching import by_hand
+from magtensor.loop.searching.by_hand import ByHand
+from magtensor.loop.searching.found import Search, Step
+from magtensor.loop.searching.gates import Candidate
+from magtensor.loop.searching.latent import NAME, sought
+from magtensor.loop.searching.outcome import described
+from magtensor.loop.searching.own_fit import at_their_own_fit
+from magtensor.loop.searching.profiling import repeatable
+from magtensor.loop.searching.rounds import with_lines
+from magtensor.loop.searching.screening import candidates_of
+from magtensor.loop.searching.search import search
 from magtensor.survey.model import Survey
 
 PERSON, LOOP, DECLARED = "person", "loop", "declared"

@@ -13,12 +13,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from magtensor.calibration.joint import JointFit
-from magtensor.loop.found import Search
-from magtensor.loop.latent import renewed
-from magtensor.loop.model import Adopted, Fitting, Record
-from magtensor.loop.refit import joint_state
-from magtensor.loop.spectrum import spectral_lines
-from magtensor.loop.wandering import unweighed
+from magtensor.loop.evidence.spectrum import spectral_lines
+from magtensor.loop.fitting.model import Adopted, Fitting, Record
+from magtensor.loop.fitting.refit import joint_state
+from magtensor.loop.fitting.wandering import unweighed
+from magtensor.loop.searching.found import Search
+from magtensor.loop.searching.latent import renewed
 
 MOST_SEARCHED = 40_000  # samples
 

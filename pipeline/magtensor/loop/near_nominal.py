@@ -9,10 +9,10 @@ from magtensor.calibration.nominal import Nominal
 from magtensor.calibration.types import ArrayCalibration
 from magtensor.calibration.undetermined import Undetermined, undetermined
 from magtensor.errors import DataError
-from magtensor.loop.found import Search
+from magtensor.loop.fitting.model import Fitting
+from magtensor.loop.fitting.refit import require_determined
 from magtensor.loop.inquiry import Inquiry
-from magtensor.loop.model import Fitting
-from magtensor.loop.refit import require_determined
+from magtensor.loop.searching.found import Search
 
 Inquire = Callable[[Fitting], Inquiry]
 

@@ -1,0 +1,39 @@
+"""Whether a survey has what an error model needs.
+
+A need is the name of a channel (`acceleration`, `current_*`), a fact of the survey (`attitude`, `position`,
+`total_field`, `rotation`, `gradient`, `travel`, `waveform`), or several of these of which one will do
+(`acceleration|attitude`). A gradient is that of the field which an array travels through, or of the calibration site,
+known once an error model of the site is adopted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from magtensor.components import Component
+from magtensor.error_models.excitation import Excitation
+from magtensor.error_models.settings import AnyChannel
+
+FACTS: dict[str, Callable[[Excitation], bool]] = {
+    "attitude": lambda x: x.attitude is not None,
+    "position": lambda x: x.position is not None,
+    "total_field": lambda x: x.total_field is not None,
+    "rotation": lambda x: x.turns,
+    "gradient": lambda x: x.site is not None or not x.uniform,
+    "travel": lambda x: not x.uniform,
+    "waveform": lambda x: x.waveform is not None,
+}
+
+
+def missing(component: Component, x: Excitation) -> list[str]:
+    """The needs of an error model that a survey does not meet, as the model words them."""
+    notes = [m for p in component.parameters.values() for m in getattr(p.annotation, "__metadata__", ())]
+    markers = [m for m in notes if isinstance(m, AnyChannel)]
+
+    def met(need: str) -> bool:
+        if need in FACTS:
+            return FACTS[need](x)
+        return bool(x.channels_like(need)) or any(m.pattern == need and m.values(x) for m in markers)
+
+    declares = component.declared({})
+    return [need for need in declares.needs if not any(met(option) for option in need.split("|"))]

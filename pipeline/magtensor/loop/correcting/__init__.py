@@ -1,0 +1,1 @@
+"""A calibration with effects, stored and applied to this or another survey."""

@@ -1,0 +1,205 @@
+"""What a survey began with and a calibration cannot know: the phase of a tone, the state of a response that lags, and
+whether what drifts or happens at a time goes on from the survey of the calibration or begins anew.
+
+All are found from the survey's own outputs, in what neither a uniform field nor a gradient can make of them, so that
+nothing a survey may be looking for is taken for an error of the instrument.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magtensor.calibration.by_sensor import by_sensor
+from magtensor.calibration.types import Array, ArrayCalibration
+from magtensor.error_models.excitation import Excitation
+from magtensor.error_models.settings import Beginning, profiled
+from magtensor.loop.fitting.model import Adopted, Record
+from magtensor.tensor.geometry import array_design
+
+TONE = "periodic_interference"
+LEAST_CONTRAST = 1e-4  # of an effect's own power, between the sensors
+SIGNIFICANT = 4.0  # standard deviations, of what is found on another survey
+LEAST_PARTS = 8  # of the survey, whose means tell how large slow noise is
+ANEW = 0.5  # of the difference between beginning anew and going on
+
+
+def as_begun_here(
+    record: Record, calibration: ArrayCalibration, own: Sequence[tuple[Adopted, Array]]
+) -> list[tuple[Adopted, Array]]:
+    """Effects with their coefficients, as they are on a survey that began otherwise than the calibration's."""
+    begun = [(a, _tone_here(record, calibration, a, t) if a.name == TONE else t) for a, t in own]
+    for number, (model, theta) in enumerate(begun):
+        names = _unknown(model)
+        if names:
+            state = _state_here(record, calibration, begun, number, names)
+            begun[number] = replace(model, settings={**model.settings, **state}), theta
+    return begun
+
+
+def _unknown(model: Adopted) -> list[str]:
+    """The settings that say what a model began with, if that is not known; else none."""
+    grids = profiled(model.component).items()
+    return [n for n, g in grids if isinstance(g, Beginning) and np.isnan(model.settings.get(n, 0.0))]
+
+
+@dataclass(frozen=True)
+class _Contrast:
+    """What neither a uniform field nor a gradient can make of outputs; with fewer than four sensors, or positions that
+    are not known, their differences."""
+
+    calibration: ArrayCalibration
+    free: Array
+    usable: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, record: Record, calibration: ArrayCalibration) -> _Contrast:
+        sensors = record.raw.shape[1]
+        held = np.tile(np.eye(3), (sensors, 1))
+        if record.position is not None and sensors > 3:
+            held = array_design(record.position, "gradient")
+        free = np.eye(3 * sensors) - held @ np.linalg.pinv(held, rcond=1e-9)
+        return cls(calibration, free, np.asarray(np.isfinite(record.raw).all(axis=(1, 2))))
+
+    def __call__(self, outputs: Array) -> Array:
+        """(n, 3 S) of outputs (N, S, 3), at the usable samples."""
+        b = by_sensor(self.calibration.matrix, outputs)[self.usable]
+        out: Array = b.reshape(len(b), -1) @ self.free
+        return out
+
+
+def _tone_here(record: Record, calibration: ArrayCalibration, model: Adopted, theta: Array) -> Array:
+    """Coefficients of a tone with the phase and strength it has on this survey; what one survey began with is another's
+    accident.
+
+    Found by least squares over the tone as it was and a quarter of a turn later, in what neither a uniform field nor a
+    gradient can make of the outputs (with fewer than four sensors: in their differences). A single sensor, and a tone
+    that all sensors see alike, leave it unknown, and nothing is taken off.
+    """
+    contrast = _Contrast.of(record, calibration)
+    raw = np.where(contrast.usable[:, None, None], record.raw, 0.0)
+    terms = model.terms(record.excitation(raw, raw))
+    half = len(theta) // 2  # cosines first, then sines
+    later = np.concatenate([theta[half:], -theta[:half]])
+    size = raw[0].size
+    both = np.column_stack([contrast(terms.contribution(t, size).reshape(raw.shape)).ravel() for t in (theta, later)])
+    if np.sum(both**2) <= LEAST_CONTRAST * contrast.usable.sum() * float(theta @ theta):
+        return np.zeros_like(theta)
+    strengths = np.linalg.svd(both.T @ both, compute_uv=False)
+    if strengths[1] < LEAST_CONTRAST * strengths[0]:  # a tone that the sampling shows as a constant has no phase
+        return theta
+    own = np.linalg.lstsq(both, contrast(raw - calibration.offset).ravel(), rcond=1e-6)[0]
+    out: Array = own[0] * theta + own[1] * later
+    return out
+
+
+def shows_a_state(raw: Array, positions_known: bool) -> bool:
+    """Whether outputs (N, S, 3) can show what a lagged response began with, a gradient of the field apart."""
+    return positions_known and raw.shape[1] > 3
+
+
+def _state_here(
+    record: Record,
+    calibration: ArrayCalibration,
+    own: Sequence[tuple[Adopted, Array]],
+    number: int,
+    names: Sequence[str],
+) -> dict[str, float]:
+    """What the lagged response of one of the effects was out of equilibrium by when the survey began: settings.
+
+    It dies away with the lag, along vectors that are known: a number, or the components of a vector, found by least
+    squares beside a constant, and 0 where slow noise could be it. With fewer than four sensors, or positions that are
+    not known, nothing tells it from a field that changes, and it is taken for 0.
+    """
+    from scipy.special import chdtrc, chdtri
+
+    none = dict.fromkeys(names, 0.0)
+    if not shows_a_state(record.raw, record.position is not None):
+        return none
+    here = _Here.of(record, calibration)
+    model, theta = own[number]
+    left = here.left(own)
+    rest = here.added(model, theta)
+    units = [replace(model, settings={**model.settings, **none, name: 1.0}) for name in names]
+    courses = np.stack([here.added(unit, theta) - rest for unit in units], axis=-1)
+    if not len(left) or float(np.sum(courses**2)) <= 0.0:
+        return none
+    left, courses = left - left.mean(axis=0), courses - courses.mean(axis=0)
+    state = np.linalg.lstsq(courses.reshape(-1, len(names)), left.ravel(), rcond=1e-6)[0]
+    course = courses @ state
+    grid = next(g for n, g in profiled(model.component).items() if n == names[0])
+    parts = max(int(np.ptp(record.time) / float(model.settings[grid.lag])), LEAST_PARTS)
+    least = float(chdtri(len(names), chdtrc(1, SIGNIFICANT**2)))
+    known = np.sum(course**2) > least * _variance(left - course, course, parts)
+    return dict(zip(names, map(float, state), strict=True)) if known else none
+
+
+@dataclass(frozen=True)
+class _Here:
+    """What effects add to the outputs of a survey, and what is left of these without them, both as contrasts."""
+
+    record: Record
+    calibration: ArrayCalibration
+    contrast: _Contrast
+    excitation: Excitation
+
+    @classmethod
+    def of(cls, record: Record, calibration: ArrayCalibration) -> _Here:
+        contrast = _Contrast.of(record, calibration)
+        b = calibration.apply(np.where(contrast.usable[:, None, None], record.raw, 0.0))
+        forward = np.asarray(np.linalg.inv(calibration.matrix), dtype=float)
+        x = record.excitation(by_sensor(forward, b) + calibration.offset, b, matrix=forward)
+        return cls(record, calibration, contrast, x)
+
+    def added(self, effect: Adopted, theta: Array) -> Array:
+        """(n, 3 S) nT."""
+        raw = self.record.raw
+        return self.contrast(effect.terms(self.excitation).contribution(theta, raw[0].size).reshape(raw.shape))
+
+    def left(self, own: Sequence[tuple[Adopted, Array]]) -> Array:
+        """(n, 3 S) nT without effects; what began unknown began in equilibrium."""
+        left = self.contrast(self.record.raw - self.calibration.offset)
+        for effect in own:
+            left = left - self.added(*effect)
+        return left
+
+
+def _variance(noise: Array, course: Array, parts: int) -> float:
+    """nT^2, of noise (n, 3 S) along the vectors of a course (n, 3 S), of its own colour: means over parts of the survey
+    tell more of it than single samples do."""
+    along = noise @ np.linalg.svd(course, full_matrices=False)[2][0]
+    means = np.array([part.mean() for part in np.array_split(along, min(parts, len(along)))])
+    return max(float(np.var(along)), float(np.var(means)) * len(along) / len(means))
+
+
+def begins_anew(
+    record: Record, calibration: ArrayCalibration, own: Sequence[tuple[Adopted, Array]], number: int
+) -> bool:
+    """Whether an effect that is known to go with the time since the survey of the calibration began goes with the time
+    since this one did.
+
+    A drift of what is switched on with the survey, a jump at the same time of each. Beginning anew has to be nearer to
+    the outputs, and its course to be seen in them whatever the offsets are, which differ from survey to survey. A
+    steady drift that goes on has the course too, and is elsewhere.
+    """
+    model, theta = own[number]
+    if model.start in (None, record.start) or not shows_a_state(record.raw, record.position is not None):
+        return False
+    here = _Here.of(record, calibration)
+    course = here.added(replace(model, start=None), theta) - here.added(model, theta)
+    left = here.left(own)
+    if not len(left) or _part(left, course) <= ANEW:
+        return False
+    left, course = left - left.mean(axis=0), course - course.mean(axis=0)
+    part = _part(left, course)
+    variance = _variance(left - part * course, course, LEAST_PARTS)
+    return part > ANEW and part**2 * float(np.sum(course**2)) > SIGNIFICANT**2 * variance
+
+
+def _part(left: Array, course: Array) -> float:
+    """How much of a course (n, 3 S) there is in what is left, by least squares."""
+    power = float(np.sum(course**2))
+    return float(np.sum(left * course)) / power if power > 0 else 0.0

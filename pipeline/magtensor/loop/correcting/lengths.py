@@ -1,0 +1,59 @@
+"""Whether a survey was recorded with averages as the calibration's was: its own lengths |b| tell.
+
+All sensors are averaged alike, and nothing that the sensors differ by shows it; but a mean is shorter than what it is
+made of, by an amount that goes with the square of the rate of turning.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magtensor.calibration.types import Array, ArrayCalibration
+from magtensor.loop.correcting.another_survey import LEAST_PARTS, SIGNIFICANT
+from magtensor.loop.correcting.correction import corrected_raw
+from magtensor.loop.fitting.model import Adopted, Record
+
+AVERAGING = "averaging"
+HALF = 0.5  # of what the effect takes off the lengths: below it the survey is nearer to having none
+
+
+def averaged_otherwise(
+    record: Record,
+    calibration: ArrayCalibration,
+    adopted: Sequence[Adopted],
+    theta: Sequence[Array],
+    good: NDArray[np.bool_],
+) -> bool:
+    """Whether the lengths of a survey's outputs refute the `averaging` of a calibration.
+
+    What it would add to |b| is sought in |b| - F without it (in |b| where the survey has no total field), beside a
+    constant of each sensor. Less than half of it there, by four standard deviations of what else moves |b|, refutes it;
+    a survey that turns too slowly, or crosses too strong a field, to tell is taken to be recorded as the calibration's.
+
+    Parameters
+    ----------
+    record: all samples of the survey, channels with the calibration's origins taken off.
+    adopted: the effects, `averaging` among them; theta: their coefficients; good: (N,) the samples that count.
+    """
+    others = [i for i, a in enumerate(adopted) if a.name != AVERAGING]
+    with_it = corrected_raw(record, calibration, adopted, theta, good)
+    without = corrected_raw(record, calibration, [adopted[i] for i in others], [theta[i] for i in others], good)
+    lengths = np.linalg.norm(calibration.apply(without), axis=2)
+    course = np.linalg.norm(calibration.apply(with_it), axis=2) - lengths
+    left = lengths if record.total_field is None else lengths - record.total_field[:, None]
+    use = good & np.isfinite(left).all(axis=1) & np.isfinite(course).all(axis=1)
+    if not use.any():
+        return False
+    left, course = left[use], course[use]
+    left, course = left - left.mean(axis=0), course - course.mean(axis=0)
+    power = float(np.sum(course**2))
+    if power <= 0.0:
+        return False
+    there = -float(np.sum(left * course)) / power
+    products = np.sum((left + there * course) * course, axis=1)  # sums over sensors: what moves all counts once
+    sums = np.array([part.sum() for part in np.array_split(products, min(LEAST_PARTS, len(products)))])
+    variance = max(float(np.sum(products**2)), float(np.sum(sums**2))) / power**2
+    return there < HALF and (1.0 - there) ** 2 > SIGNIFICANT**2 * variance

@@ -1,0 +1,286 @@
+"""Adopted effects in a calibration file: written, read again, and taken off another survey."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from datetime import datetime, timedelta
+from typing import Any
+
+import numpy as np
+
+from magtensor.calibration.types import Array, ArrayCalibration
+from magtensor.error_models.needs import FACTS
+from magtensor.error_models.settings import NOT_KNOWN, AnyChannel, Beginning, Duration, EventTimes, profiled
+from magtensor.error_models.waveform import NAME
+from magtensor.errors import DataError, UsageError
+from magtensor.loop.correcting.another_survey import TONE, begins_anew, shows_a_state
+from magtensor.loop.correcting.correction import corrected_raw, corrected_reference, hidden_in_a_bent_field
+from magtensor.loop.correcting.lengths import AVERAGING, averaged_otherwise
+from magtensor.loop.fitting.model import Adopted, Record
+from magtensor.loop.fitting.record import record_of
+from magtensor.registry import Registry
+from magtensor.survey.model import Survey, Variable
+from magtensor.survey.times import split_since
+
+MOST_BEYOND = 0.25  # of the range that a calibration has seen of a channel
+
+
+def effect_variables(
+    adopted: Sequence[Adopted], theta: Sequence[Array], origins: Mapping[str, Array], survey: Survey
+) -> dict[str, Variable]:
+    """The effects found on a survey as a variable of the group `calibration`; nothing where there are none."""
+    if not adopted:
+        return {}
+    texts = [
+        json.dumps(
+            {
+                "error_model": a.name,
+                "kind": a.component.effect,
+                "settings": dict(a.settings),
+                "sensors": list(a.sensors),
+                "theta": np.asarray(t).tolist(),
+            },
+            default=float,
+        )
+        for a, t in zip(adopted, theta, strict=True)
+    ]
+    attributes = {"channel_origins": json.dumps({k: np.asarray(v).tolist() for k, v in origins.items()})}
+    attributes["start"] = started(survey).isoformat()
+    attributes["channel_ranges"] = json.dumps(_ranges(record_of(survey, origins)))
+    return {"calibration/effects": (("effect",), np.array(texts, dtype=np.str_), attributes)}
+
+
+def stored_effects(calibration: Survey, registry: Registry) -> tuple[list[Adopted], list[Array], dict[str, Array]]:
+    """Effects, coefficients and channel origins of a calibration.
+
+    Raises:
+        UsageError: an error model of the calibration is not installed.
+    """
+    if "calibration/effects" not in calibration:
+        return [], [], {}
+    variable = calibration["calibration/effects"]
+    adopted, theta = [], []
+    for text in variable.values:
+        facts: dict[str, Any] = json.loads(str(text))
+        name = facts["error_model"]
+        if ("error_model", "", name) not in registry.components:
+            raise UsageError(f"the calibration needs the error model {name}: {registry.unknown('error_model', name)}")
+        component = registry.find("error_model", name)
+        adopted.append(Adopted(component, facts["settings"], tuple(facts["sensors"])))
+        theta.append(np.asarray(facts["theta"], dtype=float))
+    known = variable.attrs.get("channel_origins") or variable.attrs["channel_means"]  # so called up to 2026
+    origins = {k: np.asarray(v, dtype=float) for k, v in json.loads(known).items()}
+    return adopted, theta, origins
+
+
+def on_its_clock(
+    adopted: Sequence[Adopted],
+    theta: Sequence[Array],
+    origins: Mapping[str, Array],
+    calibration: Survey,
+    fitted: ArrayCalibration,
+    survey: Survey,
+) -> list[Adopted]:
+    """Effects of a calibration as they are on another survey: what happened at a time has happened since then.
+
+    A jump stays, and a drift holds its last value, unless the survey's own outputs show that it begins anew. Warming up
+    does with every survey, and what a lagged response began with is another survey's own.
+    """
+    begun = calibration["calibration/effects"].attrs.get("start") if adopted else None
+    if begun is None:
+        return list(adopted)
+    known = begun_with(adopted, datetime.fromisoformat(str(begun)), survey)
+    dated = [i for i, a in enumerate(known) if a.start is not None and a.component.effect == "instrument"]
+    if not dated:
+        return known
+    record = record_of(survey, origins=origins, every=True)
+    own = [i for i, a in enumerate(known) if a.component.effect == "instrument" and not _lacking(a, record)]
+    own = [i for i in own if known[i].name != NAME]  # its waveform here is found when the others are taken off
+    effects = [(known[i], theta[i]) for i in own]
+    anew = {i for i in dated if i in own and begins_anew(record, fitted, effects, own.index(i))}
+    return [replace(a, start=None) if i in anew else a for i, a in enumerate(known)]
+
+
+def begun_anew(adopted: Sequence[Adopted], calibration: Survey) -> str:
+    """Which effects that go with time go with another survey's own, not the calibration's; "" where none does."""
+    if not adopted or "start" not in calibration["calibration/effects"].attrs:  # nothing says when that was
+        return ""
+    return ", ".join(dict.fromkeys(a.name for a in adopted if _of_a_time(a) and a.start is None))
+
+
+@dataclass(frozen=True)
+class Here:
+    """The effects of a calibration that another survey lets be taken off, with their coefficients.
+
+    Attributes:
+        refuted: the name of what its own lengths refute; "" where nothing is.
+        left_in: what it may have and does not let be taken off, and why; "" where there is nothing.
+    """
+
+    adopted: list[Adopted]
+    theta: list[Array]
+    refuted: str
+    left_in: str
+
+
+def those_here(
+    adopted: Sequence[Adopted],
+    theta: Sequence[Array],
+    origins: Mapping[str, Array],
+    fitted: ArrayCalibration,
+    survey: Survey,
+) -> Here:
+    """The effects that another survey has too.
+
+    Rows that are averages belong to the way a survey was recorded, which its lengths may refute. A source that nobody
+    logged cannot be told from a field that bends within the array.
+    """
+    here = Here(list(adopted), list(theta), "", left_in(survey, adopted))
+    asked = {AVERAGING, NAME} & {a.name for a in adopted}
+    record = record_of(survey, origins=origins, every=True) if asked else None
+    if record is None or any(a.component.effect != "site" and _lacking(a, record) for a in adopted):
+        return here  # what it lacks is told when the effects are taken off
+    if AVERAGING in asked and averaged_otherwise(record, fitted, adopted, theta, survey.good):
+        here = _without(here, AVERAGING, refuted=AVERAGING)
+    if NAME in asked and hidden_in_a_bent_field(record, fitted, here.adopted, here.theta, survey.good):
+        words = f"{NAME}: the field bends within the array, by more than it may be told from"
+        here = _without(here, NAME, left_in="; ".join(w for w in (here.left_in, words) if w))
+    return here
+
+
+def _without(here: Here, name: str, **words: str) -> Here:
+    kept = [i for i, a in enumerate(here.adopted) if a.name != name]
+    return replace(here, adopted=[here.adopted[i] for i in kept], theta=[here.theta[i] for i in kept], **words)
+
+
+def begun_with(adopted: Sequence[Adopted], begun: datetime, survey: Survey) -> list[Adopted]:
+    """Effects of a survey that began at some date, on the clock of another survey."""
+    seconds = (begun - started(survey)).total_seconds() + float(survey.time[0])
+    if seconds != float(survey.time[0]) or shows_a_state(survey.values("b_raw"), "position" in survey):
+        adopted = [_begun_unknown(a) for a in adopted]
+    return [replace(a, start=seconds) if _of_a_time(a) else a for a in adopted]
+
+
+def _begun_unknown(model: Adopted) -> Adopted:
+    grids = profiled(model.component).items()
+    began = {n: NOT_KNOWN for n, g in grids if isinstance(g, Beginning) and g.matters(model.settings)}
+    return replace(model, settings={**model.settings, **began}) if began else model
+
+
+def _of_a_time(model: Adopted) -> bool:
+    """Whether a setting is a time, or the length, of the survey that the model was fitted to."""
+    return any(isinstance(mark, (EventTimes, Duration)) for mark in profiled(model.component).values())
+
+
+def started(survey: Survey) -> datetime:
+    """The date of a survey's first sample."""
+    parts = split_since(str(survey["time"].attrs["units"]))
+    assert parts is not None
+    return parts[1] + timedelta(seconds=float(survey.time[0]))
+
+
+def cleaned(
+    survey: Survey,
+    calibration: ArrayCalibration,
+    adopted: Sequence[Adopted],
+    theta: Sequence[Array],
+    origins: Mapping[str, Array],
+) -> Survey:
+    """The survey with the adopted effects taken off `b_raw` and `total_field`.
+
+    Raises:
+        DataError: the survey lacks a channel that an effect follows.
+    """
+    if not adopted:
+        return survey
+    record = record_of(survey, origins=origins, every=True)
+    where = str(survey.attributes.get("source", ""))
+    for effect in adopted:
+        if effect.component.effect != "site" and (lacking := _lacking(effect, record)):
+            raise DataError(
+                f"the effect {effect.name} of the calibration cannot be taken off: this survey has no {lacking}",
+                where=where,
+                hint=f"it logs {', '.join(sorted(record.logged)) or 'no channel'}; "
+                "apply a calibration without this effect, or log what it follows",
+            )
+    try:
+        raw = corrected_raw(record, calibration, adopted, theta, survey.good)
+        field = corrected_reference(record, adopted, theta)
+    except (KeyError, ValueError) as error:
+        names = ", ".join(a.name for a in adopted)
+        raise DataError(
+            f"the effects of the calibration ({names}) cannot be taken off this survey: {error}", where=where
+        ) from error
+    changed: dict[str, Variable] = {"b_raw": (("time", "sensor", "axis"), raw, dict(survey["b_raw"].attrs))}
+    if field is not None:
+        changed["total_field"] = (("time",), field, dict(survey["total_field"].attrs))
+    return survey.merged(changed)
+
+
+def _lacking(effect: Adopted, record: Record) -> str:
+    """The channel that an effect follows and a survey does not log; "" where it logs all."""
+    x = record.excitation(record.raw, record.raw)
+    for name, mark in profiled(effect.component).items():
+        if isinstance(mark, AnyChannel):
+            channel = str(effect.settings.get(name, ""))
+            if channel and channel not in record.logged:
+                return f"channel {channel}"
+            if not channel and not mark.values(x):
+                return f"channel {mark.pattern}"
+    known = {"attitude": record.attitude is not None, "position": record.position is not None}
+    marked = {m.pattern for m in profiled(effect.component).values() if isinstance(m, AnyChannel)}
+    for need in effect.component.declared({}).needs:
+        options = [o for o in need.split("|") if o not in marked]
+        if options and not any(known.get(o, o in FACTS) or x.channels_like(o) for o in options):
+            return " or ".join(options)
+    return ""
+
+
+def _ranges(record: Record) -> dict[str, list[float]]:
+    """Least and largest value of each channel, its origin taken off; those of several columns together."""
+    return {name: [float(v.min()), float(v.max())] for name, v in record.logged.items()}
+
+
+def extrapolated(survey: Survey, calibration: Survey, adopted: Sequence[Adopted], origins: Mapping[str, Array]) -> str:
+    """Which effects follow a channel beyond what the calibration has seen of it, and how far; "" where none does."""
+    known = calibration["calibration/effects"].attrs.get("channel_ranges") if adopted else None
+    if known is None or not survey.good.any():
+        return ""
+    seen, record = json.loads(str(known)), record_of(survey, origins, use=survey.good)
+    now, words = _ranges(record), []
+    for effect in (a for a in adopted if a.component.effect != "site"):  # what belongs to a site is not taken off
+        for channel in _followed(effect, record):
+            if channel not in seen or channel not in now:
+                continue
+            low, high = seen[channel]
+            beyond = max(low - now[channel][0], now[channel][1] - high)
+            if beyond > MOST_BEYOND * (high - low):
+                units = f" {record.units[channel]}" if record.units[channel] else ""
+                words.append(f"{effect.name}: {channel} goes {beyond:.3g}{units} beyond what the calibration has seen")
+    return "; ".join(dict.fromkeys(words))
+
+
+def _followed(effect: Adopted, record: Record) -> list[str]:
+    """The channels that an effect follows."""
+    x = record.excitation(record.raw, record.raw)
+    marks = {n: m for n, m in profiled(effect.component).items() if isinstance(m, AnyChannel)}
+    return [str(effect.settings.get(n, "")) or (mark.values(x) or [""])[0] for n, mark in marks.items()]
+
+
+def left_in(survey: Survey, adopted: Sequence[Adopted]) -> str:
+    """Which effects of a calibration a survey does not let be taken off, and why; "" where there are none."""
+    words = []
+    names = {a.name for a in adopted}
+    if NAME in names:
+        why = ""
+        if "position" not in survey or not np.isfinite(survey.values("position")).all():
+            why = "the sensors' positions are not known"
+        elif len(survey.sensors) < 3:
+            why = "with fewer than three sensors it cannot be told from a gradient"
+        if why:
+            words.append(f"{NAME}: {why}")
+    if TONE in names and len(survey.sensors) < 2:
+        words.append(f"{TONE}: its phase on this survey is not known from a single sensor")
+    return "; ".join(words)

@@ -1,0 +1,1 @@
+"""What the data say of regressors: the residual, the colour of its noise, significance, and gain on held-out blocks."""

@@ -1,0 +1,431 @@
+"""Significance that autocorrelation cannot fake, and held-out gain: the two gates of METHODS A2 steps 3 to 5."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magtensor.calibration.types import Array
+from magtensor.loop.evidence.grams import Grams, held_out, normal
+
+IDENTIFIABLE = 1e-6  # of a regressor's own information: a direction with less left is not estimated
+MOSTLY_NOISE = 2.0  # times the noise in regressors: less is left in a direction of which they show noise above all
+BLOCK_COUNTS = (120, 30, 12)  # long blocks protect against correlation longer than a short block
+LEAST_BLOCKS = 6
+FOLDS = 10
+INTERLEAVED_FOLDS = 20
+LEAST_T = 2.0  # paired t of the held-out gain over folds
+LEAST_SHARE_OF_FOLDS = 0.8  # a strong slow effect gains unevenly, which keeps t low, but nearly everywhere
+CONCENTRATED = 0.9  # of what is known, in one fold: the others do not predict it
+LEAST_LEFT = 1e-3  # of the information in a direction, without any one block
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Coefficients and what is known of them.
+
+    Attributes:
+        theta: (P,) in the units of the terms; minimum norm where directions are not identifiable.
+        covariance: (P, P).
+        normal: (P, P), the information, the fit's own freedom projected off.
+        rank: identifiable directions.
+    """
+
+    theta: Array
+    covariance: Array
+    normal: Array
+    rank: int
+
+    def seen(self, theta: Array) -> Array:
+        """Coefficients (P,) without their part in directions that are not identifiable."""
+        out: Array = self.covariance @ (self.normal @ theta)
+        return out
+
+
+def symmetric_eigen(m: Array) -> tuple[Array, Array]:
+    """Eigenvalues and vectors of symmetric matrices (..., P, P).
+
+    LAPACK may give up on a matrix that lacks nothing; it does not when it reads the other triangle.
+    """
+    try:
+        values, vectors = np.linalg.eigh(m)
+    except np.linalg.LinAlgError:
+        values, vectors = np.linalg.eigh(m, UPLO="U")
+    return values, vectors
+
+
+@dataclass(frozen=True)
+class Own:
+    """What regressors tell by themselves.
+
+    Attributes:
+        information: (P,) of each before the fit's own freedom was projected off.
+        noise: (P,) part of it that is noise: what noise of the outputs makes of a rate of change, above all.
+    """
+
+    information: Array
+    noise: Array
+
+    def of(self, which: NDArray[np.int_] | slice) -> Own:
+        """Those of some regressors."""
+        return Own(self.information[which], self.noise[which])
+
+    @property
+    def root(self) -> Array:
+        """(P,) a unit of which each is measured in."""
+        out: Array = np.sqrt(np.maximum(self.information, 1e-300))
+        return out
+
+    def shown(self, values: Array, vectors: Array) -> NDArray[np.bool_]:
+        """(..., P) whether regressors, in their units, show a direction, of which information (..., P) is left: more
+        than rounding, and than the noise in them."""
+        noise = MOSTLY_NOISE * (self.noise @ vectors**2) if self.noise.any() else 0.0
+        return values > np.maximum(IDENTIFIABLE, noise)
+
+
+def solve(n: Array, y: Array, own: Own) -> Estimate:
+    """Least squares in the identifiable directions of one normal matrix.
+
+    Parameters
+    ----------
+    n: (P, P), y: (P,).
+    own: of each regressor.
+    """
+    basis, values = _directions(n, own)
+    inverse = basis / values @ basis.T
+    return Estimate(inverse @ y, inverse, n, basis.shape[1])
+
+
+def _theta_of_each(n: Array, y: Array, own: Own) -> Array:
+    """(B, P) the coefficients that `solve` gives for each of the normal matrices (B, P, P) and right sides (B, P)."""
+    values, vectors, shown = _directions_of_each(n, y, own, np.broadcast_to(own.root, y.shape))
+    out: Array = (vectors @ (shown / values)[:, :, None])[:, :, 0] / own.root
+    return out
+
+
+def _directions_of_each(n: Array, y: Array, own: Own, root: Array) -> tuple[Array, Array, Array]:
+    """Of each set the information (B, P) in its directions, these (B, P, P) and what the data say along them (B, P), in
+    coefficients times root (B, P); directions that are not identifiable have infinite information and say nothing."""
+    values, vectors = symmetric_eigen(n / (root[:, :, None] * root[:, None, :]))
+    seen = own.shown(values, vectors)
+    shown = (vectors.swapaxes(1, 2) @ (y / root)[:, :, None])[:, :, 0]
+    return np.where(seen, values, np.inf), vectors, np.where(seen, shown, 0.0)
+
+
+def identifiable(n: Array, own: Own) -> Array:
+    """(P, p) the directions that an information matrix (P, P) tells from nothing, `own` as in `solve`."""
+    return _directions(n, own)[0]
+
+
+def _directions(n: Array, own: Own) -> tuple[Array, Array]:
+    """Identifiable directions (P, p) and their information (p,), in scaled coordinates undone again."""
+    root = own.root
+    values, vectors = symmetric_eigen(n / np.outer(root, root))
+    seen = own.shown(values, vectors)
+    return vectors[:, seen] / root[:, None], values[seen]
+
+
+def own_information(g: Grams) -> Own:
+    """What each regressor would tell if the fit had no freedom of its own, constants left out."""
+    return Own(own_information_of_each(g.total())[0], g.pieces.noise)
+
+
+def own_information_of_each(g: Grams) -> Array:
+    """(B, P) the same of each block or set."""
+    out = np.zeros((len(g.zz), g.count))
+    pieces = g.pieces
+    if len(pieces.term) and g.zz.any():
+        varying = g.zd[:, 3:] / np.sqrt(np.maximum(np.diagonal(g.zz, axis1=1, axis2=2)[:, 3:], 1e-300))[:, :, None]
+
+        def of_pairs(i: NDArray[np.int_], j: NDArray[np.int_]) -> Array:
+            a, b = pieces.series[i], pieces.series[j]
+            found: Array = g.dd[:, a, b] - np.sum(varying[:, :, a] * varying[:, :, b], axis=1)
+            return found
+
+        every = np.arange(len(pieces.term))
+        size = of_pairs(every, every)
+        alone = np.maximum(size, 1e-12 * g.dd[:, pieces.series, pieces.series]) * pieces.alone
+        np.add.at(out.T, pieces.term, alone.T)
+        # what moves all sensors alike is in the plane that they share, whatever each output shows alone
+        together = np.zeros_like(out)
+        np.add.at(together.T, pieces.term, (size * np.diagonal(pieces.shown)).T)
+        i, j = pieces.pairs
+        if len(i):
+            np.add.at(together.T, pieces.term[i], (of_pairs(i, j) * pieces.shown[i, j]).T)
+        out = np.maximum(together, IDENTIFIABLE * out)
+    if g.aa.any():
+        out += np.diagonal(g.aa, axis1=1, axis2=2)[:, g.own :]
+    return out
+
+
+def explained_by_each(g: Grams) -> tuple[Array, NDArray[np.int_]]:
+    """(B,) reduction of the sum of squares by all terms of each block or set, in noise of unit variance, and (B,) how
+    many directions are identifiable."""
+    n, y = normal(g)
+    root = np.sqrt(np.maximum(own_information_of_each(g), 1e-300))
+    values, _, shown = _directions_of_each(n, y, Own(root[0] ** 2, g.pieces.noise), root)
+    return np.sum(shown**2 / values, axis=1), np.isfinite(values).sum(axis=1)
+
+
+def family_p(g: Grams, sensors: Sequence[str], subset: Sequence[int] | None = None) -> float:
+    """P value that the subset's coefficients (all if None) are zero, the others being free.
+
+    For several block lengths, the largest p taken: a noise correlated for longer than the short blocks does not fool
+    the long ones. Where a family has more directions than a third of the blocks, it is tested sensor by sensor and the
+    sensors are combined (valid under any dependence). Where no block length serves a family that way, as that of a
+    source beside a hundred postures, as many of its best determined directions are tested as a third of the blocks.
+
+    Parameters
+    ----------
+    g: the finest blocks.
+    sensors: (P,) whose each term is.
+    """
+    chosen = list(range(g.count)) if subset is None else list(subset)
+    groups = [[i for i in chosen if sensors[i] == name] for name in dict.fromkeys(sensors[i] for i in chosen)]
+    finest = len(g.zz)
+    found: list[float] = []
+    for count in sorted({min(c, finest) for c in BLOCK_COUNTS}, reverse=True):
+        if count < LEAST_BLOCKS:
+            continue
+        part = g if count == finest else g.merged(count)
+        if 3 * len(chosen) <= count:
+            found.append(wald_p(part, chosen))
+            continue
+        fitting = [wald_p(part, group, alone=chosen) for group in groups if 3 * len(group) <= count]
+        if len(fitting) == len(groups) > 1:
+            found.append(cauchy_combination(fitting))
+    if not found and finest >= LEAST_BLOCKS:
+        found.append(wald_p(g, chosen, most=finest // 3))
+    return max(found, default=1.0)
+
+
+def wald_p(g: Grams, chosen: Sequence[int], alone: Sequence[int] = (), most: int | None = None) -> float:
+    """P value that the chosen coefficients are zero, the others free: delete-block jackknife (CR3), Hotelling's F.
+
+    Parameters
+    ----------
+    alone: coefficients that are not free but zero where they are not chosen. A family whose part common to all sensors
+        cannot be seen says nothing of one sensor as long as the other sensors' coefficients are free.
+    most: directions tested, those with the most information; all if None.
+    """
+    from scipy.special import fdtrc
+
+    count = len(g.zz)
+    subset = np.asarray(chosen, dtype=int)
+    own = own_information(g)
+    others = np.setdiff1d(np.arange(g.count), [*chosen, *alone])
+    full_n, full_y = _without_others(*normal(g.total()), subset, others, own)
+    basis, values = _directions(full_n[0], own.of(subset))
+    basis = basis[:, np.argsort(values)[::-1][:most]]
+    p = basis.shape[1]
+    if p == 0 or p >= count:
+        return 1.0
+    n, y = _without_others(*normal(g.without_each()), subset, others, own)
+    basis = _confirmed(basis @ np.linalg.inv(np.linalg.cholesky(basis.T @ full_n[0] @ basis)).T, n)
+    p = basis.shape[1]
+    if p == 0:
+        return 1.0  # single blocks hold nearly all there is to know: nothing can confirm it
+    theta = np.linalg.solve(basis.T @ full_n[0] @ basis, basis.T @ full_y[0])
+    small, right = basis.T @ n @ basis, y @ basis
+    spread = np.linalg.solve(small, right[:, :, None])[:, :, 0] - theta
+    covariance = (count - 1) / count * spread.T @ spread
+    try:
+        t2 = float(theta @ np.linalg.solve(covariance, theta))
+    except np.linalg.LinAlgError:
+        return 1.0
+    return float(fdtrc(p, count - p, max((count - p) / (p * (count - 1)) * t2, 0.0)))
+
+
+def _confirmed(basis: Array, n: Array) -> Array:
+    """The directions of a basis (with unit information in all blocks together) that no single block is needed for.
+
+    Parameters
+    ----------
+    basis: (P, p).
+    n: (B, P, P), the information without each block.
+    """
+    values, vectors = symmetric_eigen(basis.T @ n @ basis)
+    lost = vectors.transpose(0, 2, 1)[values < LEAST_LEFT]
+    if not len(lost):
+        return basis
+    _, s, vt = np.linalg.svd(lost, full_matrices=True)
+    rank = int(np.sum(s > 0.1 * s[0]))
+    return basis @ vt[rank:].T
+
+
+def _without_others(
+    n: Array, y: Array, chosen: NDArray[np.int_], others: NDArray[np.int_], own: Own
+) -> tuple[Array, Array]:
+    """The chosen coefficients' part of a batch of normal equations, the others projected off."""
+    if not len(others):
+        return n[:, chosen[:, None], chosen], y[:, chosen]
+    root = own.root
+    n, y = n / np.outer(root, root), y / root
+    inverse = np.linalg.pinv(n[:, others[:, None], others], rcond=1e-8, hermitian=True)
+    mixed = n[:, chosen[:, None], others]
+    n2 = n[:, chosen[:, None], chosen] - mixed @ inverse @ np.swapaxes(mixed, 1, 2)
+    y2 = y[:, chosen] - (mixed @ inverse @ y[:, others, None])[:, :, 0]
+    return n2 * np.outer(root[chosen], root[chosen]), y2 * root[chosen]
+
+
+def cauchy_combination(p_values: Sequence[float]) -> float:
+    """One p value from several that may depend on each other (ACAT, Liu and Xie 2020)."""
+    p = np.clip(np.asarray(p_values, dtype=float), 1e-300, 1 - 1e-12)
+    # tan(pi (1/2 - p)) is 1 / (pi p) for the smallest p, where the tangent itself overflows its accuracy
+    statistic = np.mean(np.where(p < 1e-15, 1 / (np.pi * p), np.tan(np.pi * (0.5 - p))))
+    if statistic > 1e15:
+        return float(1 / (np.pi * statistic))
+    return float(0.5 - np.arctan(statistic) / np.pi)
+
+
+@dataclass(frozen=True)
+class Gain:
+    """What terms gain on data their coefficients have not seen.
+
+    Attributes:
+        before, after: (folds,) sums of squared whitened residuals.
+        values: how many values each fold holds.
+    """
+
+    before: Array
+    after: Array
+    values: Array
+
+    @property
+    def total(self) -> float:
+        """Reduction of the sum of squares; twice the log likelihood ratio."""
+        return float(np.sum(self.before - self.after))
+
+    @property
+    def t(self) -> float:
+        """Paired t of the reduction per value over folds."""
+        each = (self.before - self.after) / self.values
+        spread = float(each.std(ddof=1))
+        return float(each.mean() / (spread / np.sqrt(len(each)))) if spread > 0 else 0.0
+
+    def over(self, other: Gain) -> Gain:
+        """What this gains over another on the same folds."""
+        return Gain(other.after, self.after, self.values)
+
+    @property
+    def consistent(self) -> bool:
+        """Whether the gain is there in nearly every fold, or on average by more than its scatter explains."""
+        better = (self.before > self.after).mean()
+        return self.total > 0 and (self.t > LEAST_T or better >= LEAST_SHARE_OF_FOLDS)
+
+    @property
+    def rms(self) -> tuple[float, float]:
+        """Whitened rms before and after."""
+        count = float(self.values.sum())
+        return float(np.sqrt(self.before.sum() / count)), float(np.sqrt(max(self.after.sum(), 0.0) / count))
+
+
+def held_out_gain(g: Grams, freedom: int, blocked: NDArray[np.bool_] | None = None) -> Gain:
+    """Gain over contiguous folds of equal length, a block's gap between training and test.
+
+    Parameters
+    ----------
+    g: the finest blocks.
+    freedom: residual values a sample.
+    blocked: (P,) terms that belong to both models compared.
+    """
+    count = len(g.zz)
+    return _gain_between(g, freedom, np.linspace(0, count, min(FOLDS, count) + 1).round().astype(int), blocked)
+
+
+def focused_gain(g: Grams, freedom: int, blocked: NDArray[np.bool_]) -> Gain | None:
+    """The same over contiguous folds that know equally much of the terms; None where a few blocks know nearly all.
+
+    What acts in one part of a survey only lies in one fold of equal length, and what the others predict of it is one
+    figure.
+    """
+    edges = focused_folds(g, blocked)
+    if len(edges) <= LEAST_BLOCKS:
+        return None
+    gain = _gain_between(g, freedom, edges, blocked)
+    return replace(gain, values=np.full(len(gain.values), gain.values.mean()))  # each fold should gain as much
+
+
+def focused_folds(g: Grams, blocked: NDArray[np.bool_]) -> NDArray[np.int_]:
+    """(folds + 1,) blocks where those folds begin and end: it follows from the terms and not from the data."""
+    known = np.cumsum(_share_of_blocks(g, ~blocked))
+    edges = np.unique(np.searchsorted(known, np.linspace(0.0, 1.0, FOLDS + 1)[1:-1], side="left") + 1)
+    return np.concatenate([[0], edges[edges < len(g.zz)], [len(g.zz)]])
+
+
+def concentrated(g: Grams, blocked: NDArray[np.bool_]) -> bool:
+    """Whether one contiguous fold of equal length holds nearly all that is known of the terms that are not blocked."""
+    share, count = _share_of_blocks(g, ~blocked), len(g.zz)
+    edges = np.linspace(0, count, min(FOLDS, count) + 1).round().astype(int)[:-1]
+    return bool(np.add.reduceat(share, edges).max() > CONCENTRATED)
+
+
+def _share_of_blocks(g: Grams, chosen: NDArray[np.bool_]) -> Array:
+    """(B,) how much of what is known of some terms (P,) each block knows, constants left out; the sum is 1."""
+    info = np.diagonal(g.aa, axis1=1, axis2=2)[:, g.own :].copy()
+    pieces = g.pieces
+    if len(pieces.term) and g.zz.any():
+        own, mixed = g.zz[:, 3, 3], g.zd[:, 3]
+        mean = mixed.sum(axis=0) / own.sum()
+        size = np.diagonal(g.dd, axis1=1, axis2=2) - 2.0 * mean * mixed + mean**2 * own[:, None]
+        np.add.at(info.T, pieces.term, (size[:, pieces.series] * pieces.alone).T)
+    info = np.maximum(info[:, chosen], 0.0)
+    out: Array = (info / np.maximum(info.sum(axis=0), 1e-300)).mean(axis=1)
+    return out
+
+
+def _gain_between(g: Grams, freedom: int, edges: NDArray[np.int_], blocked: NDArray[np.bool_] | None = None) -> Gain:
+    """Gain over folds of the finest blocks between edges."""
+    count, folds = len(g.zz), len(edges) - 1
+    test_masks, train_masks = np.zeros((folds, count), dtype=bool), np.ones((folds, count), dtype=bool)
+    gap = 1 if count >= 4 * folds else 0
+    for k, (a, b) in enumerate(itertools.pairwise(edges)):
+        test_masks[k, a:b] = True
+        train_masks[k, max(a - gap, 0) : b + gap] = False
+    every = np.ones(g.count, dtype=bool)
+    return gain_over(g, freedom, test_masks, train_masks, ~every if blocked is None else blocked, every)
+
+
+def interleaved_gain(g: Grams, freedom: int, before: NDArray[np.bool_], after: NDArray[np.bool_]) -> Gain:
+    """Gain of the terms `after` (P,) over those `before` (P,) on folds of blocks that lie evenly between all others.
+
+    For terms that change slowly over the survey: what they do in a long stretch does not follow from the others.
+    """
+    folds = min(INTERLEAVED_FOLDS, len(g.zz))
+    number = np.arange(len(g.zz)) % folds
+    test_masks = number == np.arange(folds)[:, None]
+    return gain_over(g, freedom, test_masks, ~test_masks, before, after)
+
+
+def gain_over(
+    g: Grams,
+    freedom: int,
+    test_masks: NDArray[np.bool_],
+    train_masks: NDArray[np.bool_],
+    before: NDArray[np.bool_],
+    after: NDArray[np.bool_],
+) -> Gain:
+    """Gain of some terms over others of them.
+
+    Parameters
+    ----------
+    g: the finest blocks.
+    freedom: residual values a sample.
+    test_masks, train_masks: (folds, B) the blocks of each fold.
+    before, after: (P,) terms of the two models compared.
+    """
+    train, test = g.chosen(train_masks), g.chosen(test_masks)
+    n, y = normal(train)
+    own = own_information(g)
+
+    def loss(terms: NDArray[np.bool_]) -> Array:
+        theta, use = np.zeros_like(y), np.flatnonzero(terms)
+        if len(use):
+            theta[:, use] = _theta_of_each(n[:, use[:, None], use], y[:, use], own.of(use))
+        return held_out(train, test, theta)[1]
+
+    return Gain(loss(before), loss(after), test.samples * freedom)

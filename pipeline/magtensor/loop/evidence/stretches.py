@@ -1,0 +1,101 @@
+"""Samples that a fit doubts and that their neighbours bear out: an effect without a model, not a spike.
+
+A strong effect that lasts (warming up, a thermoelectric current at switch-on) lies beyond all noise while it does.
+Left out as disturbed it would take the evidence for itself along. A spike stands alone.
+
+What differs from posture to posture (a gain that has jumped) has no neighbours like itself. It is no disturbance where
+it lasts longer than a held-out fold: other folds can confirm it then.
+
+Noise that is louder for a while is no disturbance either. The search does without it, the calibration need not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from magtensor.calibration.joint import JointFit
+from magtensor.calibration.joint_together import FALSE_REJECTION
+from magtensor.calibration.types import Array, Mask
+from magtensor.loop.evidence.residual import residual_of
+from magtensor.loop.evidence.statistics import FOLDS
+
+ABOUT = 25  # samples whose median roughness tells how loud the noise is: a dozen that are disturbed do not
+NEIGHBOURS = 5  # samples of a running median: what lasts for three of them is no spike
+
+
+def borne_out(fit: JointFit, raw: Array, total_field: Array, reference_noise: float = 0.0) -> Mask:
+    """(N,) the samples of a fit, and those it doubts that depart from their neighbours by no more than noise or lie in
+    a stretch longer than a fold.
+
+    Parameters
+    ----------
+    raw: (N, S, 3) nT and total_field: (N,) nT, those the fit was made from.
+    """
+    return borne_out_in(fit.keep, _parts(fit, raw, total_field, reference_noise))
+
+
+def louder(fit: JointFit, raw: Array, total_field: Array, reference_noise: float = 0.0) -> Mask:
+    """(N,) the samples of a fit, and those it doubts where the noise is louder and is all that they have.
+
+    The parameters are those of `borne_out`.
+    """
+    return louder_in(fit.keep, _parts(fit, raw, total_field, reference_noise))
+
+
+def louder_in(keep: Mask, parts: Sequence[tuple[int, Array]]) -> Mask:
+    """The same of a fit that keeps some of its samples (N,); the parameters are those of `borne_out_in`.
+
+    Noise is what differs from one sample to the next. A spike's neighbours have no more of it than others, and what
+    passes by is smooth: neither is taken for noise.
+    """
+    from scipy.ndimage import median_filter
+    from scipy.special import chdtri
+
+    count = len(keep)
+    good = np.ones(count, dtype=bool)
+    for freedom, values in parts:
+        rough = np.diff(values, axis=0, prepend=values[:1]) / np.sqrt(2.0)
+        own, its = np.sum(values**2, axis=1), np.sum(rough**2, axis=1)
+        level = median_filter(its, size=ABOUT, mode="mirror")
+        limit = chdtri(freedom, FALSE_REJECTION / (count * len(parts))) / chdtri(freedom, 0.5)
+        good &= own <= limit * np.maximum(level, np.median(its))
+    return keep | good
+
+
+def _parts(fit: JointFit, raw: Array, total_field: Array, reference_noise: float) -> list[tuple[int, Array]]:
+    """How many independent values a sample has across and along, and the whitened residuals (N, Q) of all samples."""
+    every = residual_of(replace(fit, keep=np.ones_like(fit.keep)), raw, total_field, reference_noise)
+    given = [(every.freedom - 1, every.across), (1, every.along)]
+    return [(freedom, p.reshape(len(raw), -1)) for freedom, p in given if p is not None]
+
+
+def borne_out_in(keep: Mask, parts: Sequence[tuple[int, Array]]) -> Mask:
+    """The same of a fit that keeps some of its samples (N,).
+
+    Parameters
+    ----------
+    parts: whitened residuals (N, Q) of all samples, and how many independent values a sample has in each.
+    """
+    from scipy.ndimage import median_filter
+    from scipy.special import chdtri
+
+    count = len(keep)
+    good = np.ones(count, dtype=bool)
+    for freedom, values in parts:
+        about = median_filter(values, size=(NEIGHBOURS, 1), mode="nearest")
+        end = NEIGHBOURS // 2  # the first and the last have neighbours on one side: what is alone there has none either
+        about[:end], about[-end:] = about[end], about[-end - 1]
+        apart = values - about
+        square = np.sum(apart**2, axis=1)
+        limit = chdtri(freedom, FALSE_REJECTION / (count * len(parts))) / chdtri(freedom, 0.5)
+        good &= square <= limit * np.median(square)
+    out = keep | good
+    doubtful = median_filter((~keep).astype(int), size=NEIGHBOURS, mode="nearest")
+    edges = np.flatnonzero(np.diff(doubtful, prepend=0, append=0)).reshape(-1, 2)
+    for first, end in edges:
+        if end - first > count / FOLDS:
+            out[first:end] = True
+    return out

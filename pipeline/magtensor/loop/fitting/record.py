@@ -1,0 +1,157 @@
+"""From a survey to the samples and channels that the loop works on."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magtensor.calibration.types import Array
+from magtensor.error_models.quiet import quieted
+from magtensor.error_models.station import Station
+from magtensor.loop.fitting.model import Record
+from magtensor.survey.model import Survey
+from magtensor.survey.reference import spikes
+from magtensor.units import CURRENT, TEMPERATURE, UNITS
+
+NOT_CHANNELS = (
+    "time", "sensor", "axis", "b_raw", "position", "good", "segment", "attitude", "quaternion", "total_field",
+    "total_field_std", "diurnal",
+)  # fmt: skip
+CLEARANCE = 10.0  # the reference's noise is in the residual too: what held it would seem to explain it
+GAP = 5.0  # median steps: a longer one begins a new run
+
+
+def record_of(
+    survey: Survey,
+    origins: Mapping[str, Array] | None = None,
+    *,
+    every: bool = False,
+    use: NDArray[np.bool_] | None = None,
+) -> Record:
+    """The samples of a survey that may be used, with its logged channels.
+
+    Args:
+        survey: with `b_raw` and, where there is one, `total_field`.
+        origins: what to take off each channel (a stored calibration's); this survey's own if None.
+        every: all samples, flagged or not, as a correction needs; else those a fit may use.
+        use: (N,) those samples, where a fit of several surveys has chosen them. Channels that never change are then
+            kept: another survey may hold another value.
+    """
+    raw = np.asarray(survey.values("b_raw"), dtype=float)
+    time = survey.time
+    total_field = np.asarray(survey.values("total_field"), dtype=float) if "total_field" in survey else None
+    steady = every or use is not None
+    if use is None and every:
+        use = np.ones(len(time), dtype=bool)
+    elif use is None:
+        use = survey.readings & np.isfinite(raw).all(axis=(1, 2))
+        if total_field is not None:
+            use &= np.isfinite(total_field)
+    logged, units = channels_of(survey)
+    for name, values in list(logged.items()):
+        finite = np.asarray(np.isfinite(values.reshape(len(values), -1)).all(axis=1))
+        if (finite[use].mean() if use.any() else 0.0) < 0.5:
+            del logged[name]  # hardly ever there
+        elif not finite.all():
+            logged[name] = _filled(time, values, finite)
+    keep = np.flatnonzero(use)
+    if origins is None:
+        origins = {name: origin(values[keep], units[name]) for name, values in logged.items()}
+    centred = {name: values - origins[name] for name, values in logged.items() if name in origins}
+    if not steady:  # what never changes says nothing
+        centred = {n: v for n, v in centred.items() if np.ptp(v[keep], axis=0).max(initial=0.0) > 0}
+    segment = np.asarray(survey.values("segment"), dtype=int) if "segment" in survey else np.zeros(len(time), dtype=int)
+    station = _station(survey)
+    whole = Record(
+        time=time,
+        start=float(time[0]),
+        raw=raw,
+        total_field=total_field,
+        quiet_field=_quiet(station, time, total_field),
+        station=None if total_field is None else station,
+        sensors=tuple(survey.sensors),
+        logged=centred,
+        origins={n: origins[n] for n in centred},
+        units={n: units[n] for n in centred},
+        run=runs(time, segment),
+        segment=segment,
+        position=np.asarray(survey.values("position"), dtype=float) if "position" in survey else None,
+        attitude=np.asarray(survey.values("attitude"), dtype=float) if "attitude" in survey else None,
+        samples=np.arange(len(time)),
+    )
+    return whole if len(keep) == len(time) else whole.at(keep)
+
+
+def origin(values: Array, units: str) -> Array:
+    """What is taken off a channel (N, ...), (...): zero where it has one of its own, else the mean.
+
+    Heat goes with the square of a current, not with that of its excess over the mean; and what goes both ways is zero
+    in between. A temperature's zero is a convention.
+    """
+    mean, known = values.mean(axis=0), UNITS.get(units)
+    dimension = "" if known is None else known.dimension
+    if dimension == TEMPERATURE:
+        return np.asarray(mean)
+    both_ways = (values.min(axis=0) <= 0.0) & (values.max(axis=0) >= 0.0)
+    return np.where((dimension == CURRENT) | both_ways, 0.0, mean)
+
+
+def channels_of(survey: Survey) -> tuple[dict[str, Array], dict[str, str]]:
+    """Every logged numeric channel (N,), (N, S) or (N, 3) and its units."""
+    count, sensors = len(survey.time), len(survey.sensors)
+    values: dict[str, Array] = {}
+    units: dict[str, str] = {}
+    for path in survey.paths():
+        if "/" in path or path in NOT_CHANNELS:
+            continue
+        variable = survey[path]
+        if variable.dtype.kind not in "iufb" or variable.shape not in ((count,), (count, sensors), (count, 3)):
+            continue
+        if variable.dims[0] != "time":
+            continue
+        values[path] = np.asarray(variable.values, dtype=float)
+        units[path] = str(variable.attrs.get("units", ""))
+    return values, units
+
+
+def runs(time: Array, segment: NDArray[np.int_]) -> NDArray[np.int_]:
+    """(N,) number of the contiguous run each sample belongs to."""
+    if len(time) < 2:
+        return np.zeros(len(time), dtype=int)
+    step = np.diff(time)
+    breaks = (step > GAP * np.median(step)) | (np.diff(segment) != 0)
+    return np.concatenate([[0], np.cumsum(breaks)])
+
+
+def _station(survey: Survey) -> Station | None:
+    """The base station's readings without their noise; None where the survey holds none."""
+    if not {"total_field", "reference/total_field", "reference/time"} <= set(survey.paths()):
+        return None
+    at = np.asarray(survey.values("reference/time"), dtype=float)
+    values = np.asarray(survey.values("reference/total_field"), dtype=float)
+    known = np.isfinite(at) & np.isfinite(values)
+    if known.sum() < 2:
+        return None
+    at, values = at[known], values[known]
+    made = survey["total_field"].attrs
+    if "despike" in made:
+        good = ~spikes(values, float(made["despike"]))
+        at, values = at[good], values[good]
+    at = at - float(made.get("latency_s", 0.0))
+    return Station(at, quieted(values, CLEARANCE), smooth=made.get("interpolation") == "pchip")
+
+
+def _quiet(station: Station | None, time: Array, total_field: Array | None) -> Array | None:
+    """The total field without the base station's own noise, at the survey's times."""
+    if total_field is None or station is None:
+        return total_field
+    return np.where(np.isfinite(total_field), station.at(time), np.nan)
+
+
+def _filled(time: Array, values: Array, finite: NDArray[np.bool_]) -> Array:
+    """Missing values of a channel from their neighbours in time."""
+    flat = values.reshape(len(values), -1)
+    out = np.column_stack([np.interp(time, time[finite], column[finite]) for column in flat.T])
+    return out.reshape(values.shape)

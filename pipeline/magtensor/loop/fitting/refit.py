@@ -1,0 +1,222 @@
+"""The joint fit of C, o and the coefficients of every error model."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magtensor.calibration import joint
+from magtensor.calibration.coverage import Coverage
+from magtensor.calibration.joint import JointFit, fit_joint
+from magtensor.calibration.nominal import fit_nominal
+from magtensor.calibration.types import Array
+from magtensor.error_models.delays import cleared
+from magtensor.error_models.excitation import Excitation
+from magtensor.error_models.terms import Terms, joined
+from magtensor.errors import NotEnoughData
+from magtensor.loop.evidence.assessment import Colours, colours_of, estimated, log_likelihood
+from magtensor.loop.evidence.residual import Residual, quick, residual_of, taken_off
+from magtensor.loop.evidence.statistics import Estimate
+from magtensor.loop.evidence.stretches import borne_out, louder
+from magtensor.loop.fitting.model import Adopted, Fitting, Record, State
+from magtensor.loop.fitting.seen import beside_the_site, excitation_of
+
+MOST_ROUNDS = 6
+_SLACK = 4.0  # in the error accepted while an effect may yet turn out to cause most of it
+SETTLED = 0.02  # of a standard deviation
+HARDLY_SHOWN = 1e3  # times the variance that a coefficient would have alone
+SHOWN = 3.0  # standard deviations
+_SHARES = (1.0, 0.5, 0.1)  # of a step, tried in this order
+_LIKELIHOOD_ROUNDING = 0.5  # a spectrum fitted anew is not the same to the last digit
+
+
+def joint_state(
+    record: Record,
+    adopted: Sequence[Adopted],
+    how: Fitting,
+    start: Sequence[Array] | None = None,
+    lines: Sequence[float] = (),
+    keep: NDArray[np.bool_] | None = None,
+) -> State:
+    """Fit C, o and every coefficient together.
+
+    C and o are solved in closed form for given coefficients; the coefficients then move by a Newton step in which
+    C and o are free (their tangent space projected off), until both rest.
+
+    Parameters
+    ----------
+    start: coefficients of each model to begin with; zero if None.
+    keep: (N,) samples to believe; judged anew if None.
+    """
+    theta = [np.zeros(0)] * len(adopted) if start is None else [np.array(t) for t in start]
+    raw, reference = record.raw, record.total_field
+    estimate: Estimate | None = None
+    terms: Terms | None = None
+    fit: JointFit | None = None
+    for round_ in range(MOST_ROUNDS):
+        # what attitudes can determine nobody asks between the first fit and the last
+        known = None if fit is None or round_ + 1 == MOST_ROUNDS else fit.coverage
+        fit = _fit(record, raw, reference, how, keep, known, fit)
+        x = beside_the_site(excitation_of(record, fit, raw, lines), adopted, theta)
+        if not adopted:
+            break
+        each = [a.terms(x) for a in adopted]
+        if round_ == 0:
+            theta = [t if len(t) == e.count else np.zeros(e.count) for t, e in zip(theta, each, strict=True)]
+            if any(t.any() for t in theta):
+                raw, reference = without(record, each, theta)
+                fit = _fit(record, raw, reference, how, keep, start=fit)
+                x = beside_the_site(excitation_of(record, fit, raw, lines), adopted, theta)
+                each = [a.terms(x) for a in adopted]
+        residual = quick(residual_of(fit, raw, reference, how.reference_noise))
+        terms = joined(each).at(residual.samples)
+        colours = colours_of(residual)
+        estimate = estimated(residual, terms, colours)
+        edges = np.cumsum([e.count for e in each])[:-1]
+        before = np.concatenate(theta)
+        # what no data show stays zero, whatever earlier rounds made of it
+        shown = estimate.seen(before)
+        after = shown + share_of(residual, terms, estimate.theta, colours) * estimate.theta
+        theta = np.split(after, edges)
+        raw, reference = without(record, each, theta)
+        step = np.abs(after - before) / np.sqrt(np.maximum(np.diag(estimate.covariance), 1e-300))
+        if np.max(step, initial=0.0) < SETTLED:
+            fit = _fit(record, raw, reference, how, keep, start=fit)
+            x = beside_the_site(excitation_of(record, fit, raw, lines), adopted, theta)
+            break
+    if estimate is not None:
+        shown = without_noise(np.concatenate(theta), estimate)
+        if not np.array_equal(shown, np.concatenate(theta)):
+            theta = np.split(shown, edges)
+            raw, reference = without(record, each, theta)
+            fit = _fit(record, raw, reference, how, keep, start=fit)
+            x = beside_the_site(excitation_of(record, fit, raw, lines), adopted, theta)
+    assert fit is not None
+    return _state(record, adopted, theta, fit, raw, reference, how, x, estimate, lines)
+
+
+def _state(
+    record: Record,
+    adopted: Sequence[Adopted],
+    theta: Sequence[Array],
+    fit: JointFit,
+    raw: Array,
+    reference: Array | None,
+    how: Fitting,
+    x: Excitation,
+    estimate: Estimate | None,
+    lines: Sequence[float],
+) -> State:
+    """What a fit of outputs and total field, with the effects taken off, leaves."""
+    entire = residual_of(fit, raw, reference, how.reference_noise)
+    entire = replace(entire, time=record.time[entire.samples])
+    residual = quick(entire)
+    terms = joined([a.terms(x) for a in adopted]).at(residual.samples) if adopted else None
+    left_out = None if residual is entire else entire
+    return State(tuple(adopted), tuple(theta), fit, residual, x, terms, estimate, tuple(lines), left_out)
+
+
+def without_noise(theta: Array, estimate: Estimate) -> Array:
+    """Coefficients (P,) without what noise alone has made of directions that the data hardly show.
+
+    A delay of all sensors alike is a turn of the field, and shows in the second order only, if the total field is
+    known: what is found of it is noise, many times what the differences between the sensors are known to, and would be
+    applied to every survey. Such a direction stays zero until it is significant.
+    """
+    known = np.sqrt(np.maximum(np.diag(estimate.normal), 0.0))
+    if not (known > 0).all():
+        return theta
+    inflated, directions = np.linalg.eigh(estimate.covariance * np.outer(known, known))
+    for variance, direction in zip(inflated, directions.T / known, strict=True):
+        along = float(theta @ direction) / float(direction @ direction)
+        if variance > HARDLY_SHOWN and along**2 < SHOWN**2 * variance:
+            theta = theta - along * direction
+    return theta
+
+
+def share_of(residual: Residual, terms: Terms, step: Array, colours: Colours) -> float:
+    """The part of a step that makes the residual, in noise of its own colour then, likelier; 0 if none does.
+
+    The step is the best one in noise of the colour that the residual has now, and the colour changes with it: a slow
+    effect not quite taken off looks like slow noise, in which it is then taken off even less.
+    """
+    now = log_likelihood(residual, colours)
+    for share in _SHARES:
+        left = taken_off(residual, terms, share * step)
+        if log_likelihood(left, colours_of(left)) >= now - _LIKELIHOOD_ROUNDING:
+            return share
+    return 0.0
+
+
+def _fit(
+    record: Record,
+    raw: Array,
+    reference: Array | None,
+    how: Fitting,
+    keep: NDArray[np.bool_] | None,
+    known: Coverage | None = None,
+    start: JointFit | None = None,
+) -> JointFit:
+    assert reference is not None and record.total_field is not None and record.quiet_field is not None
+    loud = record.total_field - record.quiet_field
+
+    def fitted(believed: NDArray[np.bool_] | None) -> JointFit:
+        options: dict[str, Any] = {
+            "noise": how.noise, "reference_noise": how.reference_noise, "keep": believed, "complete": how.complete,
+            "worst_error": how.worst_error if how.complete else _SLACK * how.worst_error,
+        }  # fmt: skip
+        if how.nominal is None:
+            return fit_joint(raw, reference, known=known, **options)
+        return fit_nominal(raw, reference, how.nominal, quiet_field=reference - loud, start=start, **options)
+
+    try:
+        fit = fitted(keep)
+    except NotEnoughData:
+        if not how.complete:  # refused with slack, it is refused without, and by the figures that were asked for
+            _fit(record, raw, reference, replace(how, complete=True), keep)
+        raise
+    if keep is not None or fit.keep.all():
+        return fit
+    more = (borne_out if how.searching else louder)(fit, raw, reference, how.reference_noise)
+    return fit if np.array_equal(more, fit.keep) else fitted(more)
+
+
+def reweighed(record: Record, state: State, how: Fitting) -> State:
+    """The state with C and o fitted as `how` says, its coefficients and the samples that it believes as they are."""
+    each = [a.terms(state.excitation) for a in state.adopted]
+    raw, reference = without(record, each, state.theta)
+    fit = _fit(record, raw, reference, how, np.asarray(state.fit.keep))
+    x = beside_the_site(excitation_of(record, fit, raw, state.lines), state.adopted, state.theta)
+    return _state(record, state.adopted, state.theta, fit, raw, reference, how, x, state.estimate, state.lines)
+
+
+def require_determined(record: Record, state: State, how: Fitting) -> None:
+    """Refuse a calibration whose attitudes, with all that was adopted, do not determine C and o.
+
+    Raises
+    ------
+    NotEnoughData: as in `fit_joint`.
+    """
+    raw, reference = without(record, [a.terms(state.excitation) for a in state.adopted], state.theta)
+    _fit(record, raw, reference, replace(how, complete=True), np.asarray(state.fit.keep))
+
+
+def with_colour(record: Record, state: State, how: Fitting) -> State:
+    """The state whose calibration knows the colour of its noise, as its covariance needs it."""
+    keep = slice(None) if state.fit.keep.all() else state.fit.keep
+    raw, reference = without(record, [a.terms(state.excitation) for a in state.adopted], state.theta)
+    assert reference is not None
+    return replace(state, fit=joint.with_colour(state.fit, raw[keep], reference[keep], how.reference_noise))
+
+
+def without(record: Record, each: Sequence[Terms], theta: Sequence[Array]) -> tuple[Array, Array | None]:
+    """Raw outputs and total field with the terms' contributions taken off."""
+    raw, reference = cleared(record.raw, record.time, record.run, each, theta), record.total_field
+    if reference is not None:
+        for terms, coefficients in zip(each, theta, strict=True):
+            reference = reference - terms.on_reference(coefficients)
+    return raw, reference

@@ -1,0 +1,62 @@
+"""What error models see of a fit: outputs and field as it has them, how noisy they are, the sources of the site."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from magtensor.calibration.by_sensor import by_sensor
+from magtensor.calibration.joint import JointFit, nearest_frame
+from magtensor.calibration.types import Array
+from magtensor.error_models.excitation import Excitation
+from magtensor.loop.fitting.model import Adopted, Record, of_the_site
+
+_MATTERS = 1e-10  # of the square of the field: noise with less makes no regressor noisy
+
+
+def excitation_of(record: Record, fit: JointFit, raw: Array, lines: Sequence[float] = ()) -> Excitation:
+    """Modelled outputs and field of every sample from the common field of a fit, of the length that is known: the noise
+    in what is seen of it is what the total field's residual is made of, and models would find it there.
+
+    Parameters
+    ----------
+    raw: (N, S, 3) nT, that the fit was made from: a strong effect on one sensor would else be in the common field.
+    """
+    b = fit.scalar.field(fit.plane.coordinates(raw)) if fit.posterior is None else fit.posterior.field
+    b = of_known_length(b, record.total_field)
+    q = nearest_frame(fit.forward)
+
+    def seen(b: Array) -> tuple[Array, Array]:
+        return by_sensor(fit.forward, b) + fit.offset, np.repeat((b @ q)[:, None], len(record.sensors), axis=1)
+
+    again, noise = None, fit.scalar.matrix  # of outputs divided by theirs
+    if fit.posterior is None and np.mean(noise**2) > _MATTERS * np.mean(b**2):
+        more = np.random.default_rng(0).normal(size=b.shape) @ noise.T
+        again = seen(of_known_length(b + more, record.total_field))
+    return record.excitation(*seen(b), lines, matrix=fit.forward @ q, again=again)
+
+
+def of_known_length(b: Array, total_field: Array | None) -> Array:
+    """Fields (N, 3) nT of the length (N,) nT that is known."""
+    return b if total_field is None else b * (total_field / np.linalg.norm(b, axis=1))[:, None]
+
+
+def beside_the_site(x: Excitation, adopted: Sequence[Adopted], theta: Sequence[Array]) -> Excitation:
+    """What error models see beside those of the site that are adopted: the field of these at each sensor, too.
+
+    Only of sources that are fixed in the world: their field is another one at each sensor, and turns with the attitude.
+    """
+    count, sensors = len(x.time), len(x.sensors)
+    site = np.zeros((count, 3 * sensors))
+    for model, coefficients in zip(adopted, theta, strict=True):
+        if of_the_site(model.component) and np.any(coefficients):
+            terms = model.terms(x)
+            if terms.count == len(coefficients):  # a fit may begin from those of other settings
+                site += terms.contribution(coefficients, 3 * sensors)
+    if not site.any():
+        return x
+    seen = replace(x, site=by_sensor(np.linalg.inv(x.matrix), site.reshape(count, sensors, 3)))
+    vars(seen)["matrix"] = x.matrix
+    return seen

@@ -1,0 +1,72 @@
+"""Samples that nothing explains, which no calibration had a part of: when, how large, on which sensors."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from magtensor.calibration.types import Mask
+from magtensor.loop.evidence.own_noise import OwnNoise
+from magtensor.loop.evidence.residual import residual_of
+from magtensor.loop.fitting.model import Record, State
+from magtensor.loop.fitting.refit import without
+
+LONGEST_SPIKE = 2  # samples: what lasts longer is no accident of the recording
+UNCOVERED = 2.0  # steps between samples
+FAR = 3.0  # times the rms of slow noise: where it wanders furthest it stays for a while
+
+
+def lasting(bad: Mask, excused: Mask | None = None) -> Mask:
+    """(N,) samples in runs of bad ones that are longer than a spike and its neighbour and hold none that is excused."""
+    out = np.zeros(len(bad), dtype=bool)
+    edges = np.flatnonzero(np.diff(np.concatenate(([0], bad.astype(int), [0]))))
+    for start, stop in zip(edges[0::2], edges[1::2], strict=True):
+        out[start:stop] = stop - start > LONGEST_SPIKE and (excused is None or not excused[start:stop].any())
+    return out
+
+
+def beyond_the_reference(state: State, record: Record) -> Mask:
+    """(N,) samples for which a base station whose stamps are late or early has no reading within the survey."""
+    out = np.zeros(len(record.time), dtype=bool)
+    if len(record.time) < 2:
+        return out
+    step = float(np.median(np.diff(record.time)))
+    for model in state.adopted:
+        if model.component.effect == "reference" and (lag := float(model.settings.get("lag_s", 0.0))):
+            at = record.time + lag
+            after = np.clip(np.searchsorted(record.time, at), 1, len(record.time) - 1)
+            nearest = np.minimum(np.abs(at - record.time[after - 1]), np.abs(at - record.time[after]))
+            out |= nearest > UNCOVERED * step
+    return out
+
+
+def flagged_words(flagged: Mask, state: State, record: Record) -> tuple[str, bool]:
+    """How many samples were taken out of use because nothing explains them, when, how large, on which sensors; and
+    whether the slow noise of the sensors goes as far, being no outlier of white noise that it is."""
+    raw, reference = without(record, [a.terms(state.excitation) for a in state.adopted], state.theta)
+    every = residual_of(replace(state.fit, keep=np.ones(len(flagged), dtype=bool)), raw, reference)
+    runs = int(np.sum(np.diff(np.concatenate(([0], flagged.astype(int)))) == 1))
+    after = record.time[flagged] - record.start
+    shared = 0.0 if every.along is None else float(np.mean(every.along[flagged] ** 2))
+    own = np.zeros(1)
+    if every.across is not None:
+        own = np.mean(every.across[flagged].reshape(int(flagged.sum()), -1, 3) ** 2, axis=(0, 2))
+    if every.along is not None and shared > own.max():
+        amount = float(np.sqrt(np.mean((every.along[flagged] / every.reference_gain[flagged]) ** 2)))
+        usual = OwnNoise(state.residual, None).slow_along()
+        where = " of |b| - F" + ("" if every.across is None else ", in all sensors alike")
+    else:
+        worst = int(np.argmax(own))
+        amount = float(np.sqrt(own[worst] * np.mean(every.noise[3 * worst : 3 * worst + 3] ** 2)))
+        slow = OwnNoise(state.residual, None).slow_std()[3 * worst : 3 * worst + 3]
+        usual = float(np.sqrt(np.mean(slow**2)))
+        where = f", mostly on {state.excitation.sensors[worst]}"
+    stretches = f"{runs} stretch{'es' * (runs > 1)}"
+    words = (
+        f"{int(flagged.sum())} samples in {stretches} ({after[0]:.4g} to {after[-1]:.4g} s after the start) fit no "
+        f"calibration, by {amount:.3g} nT rms{where}: they are flagged and have no part in the calibration"
+    )
+    if amount > FAR * usual:
+        return words, False
+    return f"{words}; slow noise, of {usual:.3g} nT rms there, may go as far", True

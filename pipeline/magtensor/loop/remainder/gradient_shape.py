@@ -1,0 +1,63 @@
+"""Whether what differs between the sensors has the shape of a uniform gradient of the field.
+
+A gradient of the site, or of anything far away, adds G p to a sensor at p. G is symmetric and traceless: of the
+3 S - 3 values that a residual has across the plane no more than five directions, whatever G does in time. Noise of the
+sensors, slow or not, knows no such directions, and neither do their own errors.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from magtensor.calibration.joint import nearest_frame
+from magtensor.calibration.types import Array
+from magtensor.loop.fitting.model import State
+
+MODEL = "site_gradient"
+MOST_OUTSIDE = 0.1  # of the variance of each of its directions: what any other direction holds at most
+LEAST_SECOND = 0.05  # of the strongest direction: a single waveform of any source has but one
+BEYOND_CHANCE = 5.0  # standard deviations of the white noise's own variance
+_RANK = 1e-6
+
+
+def gradient_share(state: State, position: Array | None) -> float:
+    """The part of the residual's variance across, above the white noise, that a uniform gradient makes.
+
+    Parameters
+    ----------
+    position: (S, 3) m, None where it is not known.
+
+    Returns
+    -------
+    Within 0 and 1; 0 where the array cannot tell, where one waveform would do, or where other directions hold too much.
+    """
+    residual = state.residual
+    if position is None or residual.across is None:
+        return 0.0
+    forward = state.fit.forward @ nearest_frame(state.fit.forward)
+    shown = np.einsum("sij,kjl,sl->sik", forward, _symmetric(), position - position.mean(0)).reshape(-1, 5)
+    directions, size, _ = np.linalg.svd(residual.projector @ (shown / residual.noise[:, None]), full_matrices=False)
+    directions = directions[:, size > _RANK * size[0]] if size[0] > 0 else directions[:, :0]
+    most, held = len(residual.noise) - 3, directions.shape[1]
+    n, spent = residual.affine.shape
+    if not 1 < held < most or n <= spent:
+        return 0.0
+    covariance = residual.across.T @ residual.across / (n - spent)
+    white = state.colours.across.white
+    inside = np.linalg.eigvalsh(directions.T @ covariance @ directions) - white
+    total, of_gradient = float(np.trace(covariance)) - most * white, float(inside.sum())
+    each_outside, each_inside = (total - of_gradient) / (most - held), of_gradient / held
+    if of_gradient < BEYOND_CHANCE * white * np.sqrt(2.0 * held / n):
+        return 0.0
+    if each_outside > MOST_OUTSIDE * each_inside or inside[-2] < LEAST_SECOND * inside[-1]:
+        return 0.0
+    return min(of_gradient / total, 1.0)
+
+
+def _symmetric() -> Array:
+    """(5, 3, 3) symmetric matrices without trace."""
+    out = np.zeros((5, 3, 3))
+    for k, (i, j) in enumerate(((0, 1), (0, 2), (1, 2))):
+        out[k, i, j] = out[k, j, i] = 1.0
+    out[3], out[4] = np.diag([1.0, -1.0, 0.0]), np.diag([1.0, 1.0, -2.0])
+    return out

@@ -1,0 +1,273 @@
+"""Refit with a model that is adopted: on which of its sensors, and with its settings sought once more."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from magtensor.error_models.settings import Forms, Frequencies, Range, profiled
+from magtensor.error_models.terms import Terms
+from magtensor.error_models.waveform import NAME
+from magtensor.loop.evidence.assessment import estimated, explained
+from magtensor.loop.evidence.golden import golden
+from magtensor.loop.evidence.scoring import Scorer
+from magtensor.loop.fitting.model import Adopted, Fitting, Record, State
+from magtensor.loop.fitting.refit import joint_state
+from magtensor.loop.fitting.separation import SEPARATION
+from magtensor.loop.searching.beginnings import beginning, extent, least_gain, with_beginning
+from magtensor.loop.searching.contribution import KEEP_ALPHA, held_out, put_back, significance, slices
+from magtensor.loop.searching.gates import Candidate
+from magtensor.loop.searching.split import coefficients
+
+POLISH = 0.1  # of a setting, or of the width of a line, to either side
+_SWEEPS = 6  # over all settings, where two models of one kind are in
+_RESTS = 0.02  # relative: a setting that moves no further is settled
+
+
+def adopt(record: Record, state: State, chosen: Candidate, how: Fitting) -> State:
+    """Refit with the chosen model, first on all sensors, then on those that show it."""
+    models = [*state.adopted, chosen.model]
+    # what it found of the others too: begun from zero, a strong slow effect would pass for the colour of the noise
+    if chosen.moved is not None:
+        place, models[place] = chosen.moved
+        start = coefficients(state, chosen)
+    else:
+        moves = np.split(chosen.assessment.theta, np.cumsum([len(t) for t in state.theta]))
+        start = [t + move for t, move in zip([*state.theta, np.zeros(chosen.terms.count)], moves, strict=True)]
+    after = joint_state(record, models, how, start)
+    which = len(state.adopted)
+    sensors = _sensors_showing(after, which)
+    if sensors is None or not _spare(after, which, sensors):
+        sensors = _sufficient(after, which)
+    return after if sensors is None else narrowed(record, after, which, sensors, how)
+
+
+def narrowed(record: Record, state: State, which: int, sensors: tuple[str, ...], how: Fitting) -> State:
+    """Refit with one of the models on some of its sensors only."""
+    model = state.adopted[which]
+    models = list(state.adopted)
+    models[which] = Adopted(model.component, model.settings, sensors)
+    assert state.terms is not None
+    part = slices(state)[which]
+    keep = [i for i, s in enumerate(state.terms.sensors[part]) if s in sensors or s == ""]
+    theta = list(state.theta)
+    theta[which] = theta[which][keep]
+    return joint_state(record, models, how, theta)
+
+
+def on_those_that_show(record: Record, state: State, how: Fitting, fixed: int) -> State:
+    """Refit with every model that was found on those of its sensors that show it beside all others.
+
+    When it was adopted, what had no name yet on one sensor was in the field that all of them see, and so seemed to be a
+    little of it on each.
+    """
+    for which in range(fixed, len(state.adopted)):
+        if state.adopted[which].name == NAME or len(state.adopted) == fixed + 1:
+            continue
+        sensors = _sensors_showing(state, which)
+        if sensors is not None and _spare(state, which, sensors):
+            state = narrowed(record, state, which, sensors, how)
+    return state
+
+
+def _spare(state: State, which: int, sensors: tuple[str, ...]) -> bool:
+    """Whether a model can do without its coefficients for all but some sensors.
+
+    A coefficient may be insignificant because others can stand in for it, as where only differences between sensors
+    are seen (a delay of all of them is a turn of the field): each could go, and not several of them. All that go have
+    to predict no more on held-out blocks than what tells two models apart.
+    """
+    gone, seen, _ = _without_others(state, which, sensors)
+    if seen < gone:
+        return False
+    gain = held_out(state, _kept(state, which, sensors))
+    return not (gain.total >= SEPARATION and gain.consistent)
+
+
+def _sufficient(state: State, which: int) -> tuple[str, ...] | None:
+    """The one sensor whose coefficients explain all that a model does, where others can stand in for them.
+
+    If only differences between sensors are seen, one that turned is like all others turned the other way: every
+    coefficient is significant, or none is. None where no sensor suffices, or several do.
+    """
+    from scipy.special import chdtri
+
+    assert state.terms is not None
+    owners = state.terms.sensors[slices(state)[which]]
+    found = []
+    for sensor in sorted(set(owners) - {""}):
+        gone, seen, lost = _without_others(state, which, (sensor,))
+        if 0 < seen < gone and lost < float(chdtri(seen, KEEP_ALPHA)):
+            found.append(sensor)
+    return tuple(found) if len(found) == 1 else None
+
+
+def _without_others(state: State, which: int, sensors: tuple[str, ...]) -> tuple[int, int, float]:
+    """Of a model's coefficients for all but some sensors: how many, how many directions of them the survey shows, and
+    what is explained no longer without them."""
+    assert state.terms is not None
+    kept = _kept(state, which, sensors)
+    back = put_back(state.residual, state.terms, np.concatenate(state.theta))
+    every = estimated(back, state.terms, state.colours)
+    fewer = estimated(back, state.terms.only(kept), state.colours)
+    return state.terms.count - len(kept), every.rank - fewer.rank, explained(every) - explained(fewer)
+
+
+def _kept(state: State, which: int, sensors: tuple[str, ...]) -> list[int]:
+    """The numbers of all coefficients but those of a model for other sensors."""
+    assert state.terms is not None
+    part = slices(state)[which]
+    return [i for i, s in enumerate(state.terms.sensors) if not part.start <= i < part.stop or s in sensors or s == ""]
+
+
+def _sensors_showing(state: State, which: int) -> tuple[str, ...] | None:
+    """Sensors whose own coefficients are significant; None where all are, or the model is not of single sensors."""
+    part = slices(state)[which]
+    assert state.terms is not None
+    owners = state.terms.sensors[part]
+    names = [s for s in state.excitation.sensors if s in owners]
+    if len(names) < 2:
+        return None
+    showing = [
+        s
+        for s in names
+        if significance(state, [part.start + i for i, o in enumerate(owners) if o == s]) < KEEP_ALPHA / len(names)
+    ]
+    return tuple(showing) if showing and len(showing) < len(names) else None
+
+
+def polished(record: Record, state: State, how: Fitting) -> State:
+    """The forms of the models, what they began with and their settings on a range, sought once more now that everything
+    is fitted together; a setting that is a little off leaves a residual that another model would be adopted for."""
+    state = _as_they_began(record, _in_their_forms(record, state, how), how)
+    for _ in range(_SWEEPS):
+        moved = False
+        for number, model in enumerate(state.adopted):
+            for name, grid in profiled(model.component).items():
+                if not isinstance(grid, (Range, Frequencies)) or not state.adopted[number].settings[name]:
+                    continue
+                here = float(state.adopted[number].settings[name])
+                whole = abs(here) if isinstance(grid, Range) else 1.0 / state.excitation.duration
+                gain = _Beside.of(state, number)
+                best = _near(gain, state.adopted[number].settings, name, here - POLISH * whole)
+                if best == here:
+                    continue
+                moved |= abs(best - here) > _RESTS * abs(here)
+                state = _changed(record, state, number, {name: best}, how)
+        # one setting of a kind rests at once; of two, one moves as the other does
+        if not moved or len({a.name for a in state.adopted}) == len(state.adopted):
+            break
+    return state
+
+
+def _in_their_forms(record: Record, state: State, how: Fitting) -> State:
+    """Every model in the forms that the data separate from others, with the settings on a range that suit these."""
+    for number, model in enumerate(state.adopted):
+        grids = profiled(model.component)
+        forms = {name: grid for name, grid in grids.items() if isinstance(grid, Forms)}
+        if not forms:
+            continue
+        ranges = {name: grid for name, grid in grids.items() if isinstance(grid, Range)}
+        gain = _Beside.of(state, number)
+        best = dict(model.settings)
+        for name, grid in forms.items():
+            for form in [form for form in grid.options if form != best[name]]:
+                changed = _suited(gain, {**best, name: form}, ranges)
+                if gain(changed) > gain(best) + SEPARATION / 2.0:
+                    best = changed
+        if best != model.settings:
+            state = _changed(record, state, number, best, how)
+    return state
+
+
+def _as_they_began(record: Record, state: State, how: Fitting) -> State:
+    """Every lagged model with what it had from before the survey began, where the data separate it from nothing."""
+    for number, model in enumerate(state.adopted):
+        found = beginning(model.component, model.settings)
+        if found is None or not found[1].matters(model.settings):
+            continue
+        names, mark = found
+        gain = _Beside.of(state, number)
+        widest = extent(model.component, model.settings, state.excitation)
+        best = _with_beginning(gain, model.settings, names, mark.lag, widest)
+        at_rest = {**model.settings, **dict.fromkeys(names, 0.0)}
+        if gain(best) <= gain(at_rest) + least_gain(names):
+            best = at_rest
+        if best != model.settings:
+            state = _changed(record, state, number, best, how)
+    return state
+
+
+def _with_beginning(
+    gain: _Beside, settings: Mapping[str, Any], names: Sequence[str], lag: str, widest: float
+) -> dict[str, Any]:
+    """Settings with the best beginning within limits, and the lag that goes with it."""
+    best = dict(settings)
+    for _ in range(_SWEEPS):
+        found = with_beginning(gain.score.white, gain.terms, best, names, widest, _SWEEPS)
+        if found is None:
+            return best
+        before, best = best[lag], found
+        best[lag] = _near(gain, best, lag, (1.0 - POLISH) * before)
+        if abs(best[lag] - before) <= _RESTS * before:
+            break
+    return best
+
+
+def _suited(
+    gain: Callable[[Mapping[str, Any]], float], settings: dict[str, Any], ranges: Mapping[str, Range]
+) -> dict[str, Any]:
+    """Settings whose lags suit the others: up to twice as long as they are, none if the data do not separate it."""
+    for name, grid in ranges.items():
+        if settings[name] > 0:
+            settings = {**settings, name: _near(gain, settings, name, max(grid.low, 0.0))}
+            none = {**settings, name: 0.0}
+            if grid.low <= 0 and gain(settings) < gain(none) + SEPARATION / 2.0:
+                settings = none
+    return settings
+
+
+def _changed(record: Record, state: State, number: int, settings: Mapping[str, Any], how: Fitting) -> State:
+    """Refit with other settings of one of the models."""
+    models = list(state.adopted)
+    models[number] = replace(models[number], settings={**models[number].settings, **settings})
+    return joint_state(record, models, how, state.theta)
+
+
+def _near(gain: Callable[[Mapping[str, Any]], float], settings: Mapping[str, Any], name: str, low: float) -> float:
+    """The best value of a setting as far from where it is as `low` is."""
+    here = float(settings[name])
+    return golden(lambda value: gain({**settings, name: value}), low, 2.0 * here - low, here)
+
+
+@dataclass(frozen=True)
+class _Beside:
+    """What one of the adopted models explains beside the others, for given settings.
+
+    Attributes:
+        own: the model; score: beside the others, in noise of the colour that all of them leave.
+    """
+
+    own: Adopted
+    state: State
+    score: Scorer
+
+    @classmethod
+    def of(cls, state: State, number: int) -> _Beside:
+        own = slices(state)[number]
+        assert state.terms is not None
+        mine = state.terms.only(range(own.start, own.stop))
+        others = [i for i in range(state.terms.count) if not own.start <= i < own.stop]
+        back = put_back(state.residual, mine, state.theta[number])
+        score = Scorer(back, state.terms.only(others) if others else None, state.colours)
+        return cls(state.adopted[number], state, score)
+
+    def terms(self, settings: Mapping[str, Any]) -> Terms:
+        """Its regressors at the residual's samples."""
+        return replace(self.own, settings=settings).terms(self.state.excitation).at(self.state.residual.samples)
+
+    def __call__(self, settings: Mapping[str, Any]) -> float:
+        return self.score(self.terms(settings))

@@ -1,0 +1,222 @@
+"""What adopted models contribute beside each other, and which no longer earn their place."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magtensor.calibration.types import Array
+from magtensor.error_models.settings import EventTimes, Frequencies, profiled
+from magtensor.error_models.terms import Terms
+from magtensor.error_models.waveform import NAME
+from magtensor.loop.evidence.assessment import WHITE, Colours, block_count, estimated_in, explained
+from magtensor.loop.evidence.grams import Grams, Whitened, grams
+from magtensor.loop.evidence.own_noise import OwnNoise
+from magtensor.loop.evidence.residual import Residual, taken_off
+from magtensor.loop.evidence.statistics import Gain, concentrated, family_p, focused_gain, held_out_gain
+from magtensor.loop.fitting.model import Adopted, Fitting, Record, State
+from magtensor.loop.fitting.refit import joint_state
+from magtensor.loop.fitting.trial import WORST_RISE
+
+LEAST_FALL = 5e-4  # of the error on held-out blocks, by what lasts: 3 % of the noise is no effect anybody would miss
+APART_ALPHA = 1e-4  # what differs between sensors has to be as unlikely, before an effect of all is not the reference's
+KEEP_ALPHA = 0.01  # an adopted effect that is no longer significant at this level is dropped
+
+
+def slices(state: State) -> list[slice]:
+    edges = np.cumsum([0, *(len(t) for t in state.theta)])
+    return [slice(int(a), int(b)) for a, b in itertools.pairwise(edges)]
+
+
+def significance(state: State, chosen: Sequence[int]) -> float:
+    """P value of some of the adopted coefficients, the others free: of the residual with their part put back."""
+    assert state.terms is not None
+    return family_p(_blocks(state), state.terms.sensors, list(chosen))
+
+
+def held_out(state: State, given: Sequence[int]) -> Gain:
+    """What all other coefficients gain on held-out blocks beside the given ones."""
+    assert state.terms is not None
+    return held_out_gain(_blocks(state), state.residual.freedom, np.isin(np.arange(state.terms.count), given))
+
+
+def _blocks(state: State, colours: Colours | None = None) -> Grams:
+    """Of the adopted terms and the residual with their part put back, in the finest blocks, in noise of its own colour
+    or another."""
+    assert state.terms is not None
+    back = put_back(state.residual, state.terms, np.concatenate(state.theta))
+    noise = colours or state.colours
+    return grams(back, state.terms, noise.across, noise.along, block_count(len(state.residual.affine)))
+
+
+def removal(state: State, *places: int) -> tuple[float, float]:
+    """Held-out rms of the residual in nT, all noise alike, without and with some of the adopted models, the others in
+    both."""
+    before, after = held_out_gain(_blocks(state, WHITE), state.residual.freedom, _all_but(state, places)).rms
+    return before * state.residual.scale, after * state.residual.scale
+
+
+def _all_but(state: State, places: Sequence[int]) -> NDArray[np.bool_]:
+    """(P,) the coefficients of the other models."""
+    assert state.terms is not None
+    others = np.ones(state.terms.count, dtype=bool)
+    for place in places:
+        others[slices(state)[place]] = False
+    return others
+
+
+def of_all_alike(state: State, place: int) -> bool:
+    """Whether an adopted model explains nothing of what differs between the sensors: all it does may be done by the
+    total field that they are compared with."""
+    assert state.terms is not None
+    own = slices(state)[place]
+    if state.residual.across is None or state.residual.along is None:
+        return False
+    from scipy.special import chdtrc
+
+    order = np.arange(state.terms.count)
+    mine = state.terms.only(range(own.start, own.stop))
+    back = put_back(state.residual, mine, state.theta[place])
+    others = state.terms.only(int(i) for i in order[(order < own.start) | (order >= own.stop)])
+    white = Whitened.of(replace(back, along=None), state.colours.across, state.colours.along, others, over_time=False)
+    with_it, without = estimated_in(white, mine), estimated_in(white, None)
+    gained = explained(with_it) - explained(without)
+    return with_it.rank == without.rank or float(chdtrc(with_it.rank - without.rank, max(gained, 0.0))) > APART_ALPHA
+
+
+def put_back(residual: Residual, terms: Terms, theta: Array) -> Residual:
+    """The residual as it would be without the correction, to first order."""
+    return taken_off(residual, terms, -theta)
+
+
+def put_back_one(state: State, place: int) -> State:
+    """The state as it would be without one of the models, to first order: its part in the residual, the terms of the
+    others alone."""
+    assert state.terms is not None
+    own = slices(state)[place]
+    mine = state.terms.only(range(own.start, own.stop))
+    rest = [i for i in range(state.terms.count) if not own.start <= i < own.stop]
+    residual = put_back(state.residual, mine, state.theta[place])
+    return replace(state, residual=residual, terms=state.terms.only(rest) if rest else None)
+
+
+def eliminate(record: Record, state: State, how: Fitting, fixed: int) -> tuple[State, tuple[str, ...]]:
+    """Drop models that no longer earn their place, the weakest first: those whose coefficients are not what their
+    settings assume, those that are not significant beside the others, and those without which the others predict
+    held-out blocks as well, or better if all noise counts alike. A single one has just passed the gates but for the
+    last: what raises the error on blocks that it has not seen is no effect, whatever noise it makes white."""
+    if len(state.adopted) == 1:
+        if fixed or not _lasts(state.adopted[0]) or _rise(state, 0) <= 1.0:
+            return state, ()
+        return without_models(record, state, [0], how), (state.adopted[0].name,)
+    dropped: list[str] = []
+    while len(state.adopted) > fixed:
+        assert state.terms is not None
+        blocks, freedom = _blocks(state), state.residual.freedom
+        parts = slices(state)[fixed:]
+        values = [
+            _of_an_event(state, fixed + i)
+            if happens_once(state.adopted[fixed + i])
+            else family_p(blocks, state.terms.sensors, list(range(p.start, p.stop)))
+            for i, p in enumerate(parts)
+        ]
+        order = np.arange(state.terms.count)
+        gains = [held_out_gain(blocks, freedom, (order < p.start) | (order >= p.stop)).total for p in parts]
+        rises = [_rise(state, fixed + i) for i in range(len(parts))]
+        unlike = [i for i in range(fixed, len(state.adopted)) if not agrees(state, i)]
+        if unlike:
+            weakest = unlike[0]
+        elif max(values) >= KEEP_ALPHA:
+            weakest = fixed + int(np.argmax(values))
+        elif min(gains) <= 0:
+            weakest = fixed + int(np.argmin(gains))
+        elif max(rises) > 1.0:
+            weakest = fixed + int(np.argmax(rises))
+        else:
+            break
+        dropped.append(state.adopted[weakest].name)
+        state = without_models(record, state, [weakest], how)
+    return state, tuple(dropped)
+
+
+def _of_an_event(state: State, place: int) -> float:
+    """P value of an adopted model of what happened once, beside the others, all times corrected for at which it might
+    have: its part in two or three blocks has no scatter."""
+    assert state.terms is not None
+    own = slices(state)[place]
+    mine = state.terms.only(range(own.start, own.stop))
+    others = [i for i in range(state.terms.count) if not own.start <= i < own.stop]
+    noise = OwnNoise(put_back(state.residual, mine, state.theta[place]), state.terms.only(others) if others else None)
+    times = [g.count for g in profiled(state.adopted[place].component).values() if isinstance(g, EventTimes)]
+    return noise.p_value(mine) * float(np.prod(times))
+
+
+def _rise(state: State, place: int) -> float:
+    """The factor by which an adopted model raises the error on held-out blocks, over what it may.
+
+    What lasts has to lower it. Of what happened once the blocks where it did say little, and what holds a waveform has
+    its noise: both may raise it somewhat. Of what lies in one fold, as a warming up that is soon over, the folds that
+    know equally much are asked, and where only a few blocks know anything it is as if it had happened once.
+    """
+    others, lasting = _all_but(state, [place]), _lasts(state.adopted[place])
+    blocks, freedom = _blocks(state, WHITE), state.residual.freedom
+    gain = held_out_gain(blocks, freedom, others)
+    if lasting and concentrated(blocks, others):
+        focused = focused_gain(blocks, freedom, others)
+        gain, lasting = focused or gain, focused is not None
+    before, after = gain.rms
+    return after / before / (1.0 - LEAST_FALL if lasting else 1.0 + WORST_RISE)
+
+
+def _lasts(model: Adopted) -> bool:
+    """Whether a model is neither of what happened once nor of a waveform found in the data."""
+    return model.name != NAME and not happens_once(model)
+
+
+def happens_once(model: Adopted) -> bool:
+    """Whether a model is of an event, whose time is a setting."""
+    return any(isinstance(g, EventTimes) for g in profiled(model.component).values())
+
+
+def a_tone(model: Adopted) -> bool:
+    """Whether a model is of a tone, whose frequency is where the spectrum of what is left is strongest."""
+    return any(isinstance(g, Frequencies) for g in profiled(model.component).values())
+
+
+def agrees(state: State, place: int) -> bool:
+    """Whether the coefficients of an adopted model are what its settings assume, and explain what they then must."""
+    model = state.adopted[place]
+    test = model.component.agrees
+    return test is None or test(model.settings, state.theta[place], explained_share(state, place))
+
+
+def explained_share(state: State, place: int) -> float:
+    """The share of |b| - F that an adopted model explains, of what lasts from one sample to the next: white noise, in
+    which there is nothing to explain, has no part in it. 1 without a total field, or where nothing lasts."""
+    assert state.terms is not None
+    own = slices(state)[place]
+    mine = state.terms.only(range(own.start, own.stop))
+    without, left = put_back(state.residual, mine, state.theta[place]).along, state.residual.along
+    if without is None or left is None:
+        return 1.0
+    lasting = without[1:] @ without[:-1]
+    its = without - left
+    both = 0.5 * (without[1:] @ its[:-1] + without[:-1] @ its[1:])
+    return float(both / lasting) if lasting > 0 else 1.0
+
+
+def share_of_the_field(state: State, place: int) -> float:
+    """The largest coefficient of an adopted model that is a share of the field; 0 of a model in other units."""
+    assert state.terms is not None
+    units = state.terms.units[slices(state)[place]]
+    return max((abs(c) * 1e-6 for c, u in zip(state.theta[place], units, strict=True) if u == "ppm"), default=0.0)
+
+
+def without_models(record: Record, state: State, places: Sequence[int], how: Fitting) -> State:
+    """The fit without some of its models."""
+    rest = [i for i in range(len(state.adopted)) if i not in places]
+    return joint_state(record, [state.adopted[i] for i in rest], how, [state.theta[i] for i in rest], state.lines)

@@ -1,0 +1,145 @@
+"""Whether a response follows its channel, or any smooth course of time would do.
+
+A thermometer that settles is a smooth course of time, and so is a drift. Seen through a lag, from a beginning that is
+fitted, such a channel comes near to many drifts and follows none of them quite. Two questions tell: does the channel
+explain anything beside smooth courses of time in its place, and do these explain anything beside the channel. Where it
+does not and they do, the data know a course of time that is not the channel's. And where a far larger one is adopted
+already, whose law nobody knows, what the channel would explain beside it may as well be that law's. What lags the
+field by as much as the survey is long is asked the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from magtensor.error_models.excitation import Excitation
+from magtensor.error_models.settings import Beginning, Choice, Orders, Range, profiled
+from magtensor.error_models.terms import Terms, joined
+from magtensor.loop.evidence.assessment import WHITE, colours_of, estimated, explained
+from magtensor.loop.evidence.residual import taken_off
+from magtensor.loop.fitting.log_noise import channels_of
+from magtensor.loop.fitting.model import Adopted, State
+from magtensor.loop.searching.beginnings import beginning, one_pattern
+from magtensor.loop.searching.contribution import happens_once
+from magtensor.loop.searching.gates import Candidate
+from magtensor.loop.searching.kin import TIME, drivers, explained_by_courses
+from magtensor.loop.searching.profiling import REFINING_SAMPLES, thinned
+from magtensor.loop.searching.rivals import overlaps
+
+COURSES = 8  # polynomials of the root of time, which is steep at the start: a thirtieth of the survey is resolved there
+FIRST_LEFT = 2 * COURSES  # the lowest cosine frequency at which they leave the slow noise that there is
+SEEN = 1e-3  # probability that noise makes a channel explain as much beside them
+MORE = 1e-5  # the same of them beside a channel: slow noise is not known to better than that
+MISSED = 0.1  # of the sum of squares, by the law of a drift: a third of its size, as a line misses of what slows down
+THE_FIELD = "the field"  # no channel has that name
+STEP = 0.01  # of a setting, over which the change of what it explains is taken
+
+
+@dataclass(frozen=True)
+class BesideTime:
+    """What smooth courses of time say of a response.
+
+    Attributes:
+        seen: whether its channel explains anything beside them.
+        refused: why it is no more than one of them; "" where it may be.
+    """
+
+    seen: bool
+    refused: str = ""
+
+
+def beside_time(candidate: Candidate, state: State) -> BesideTime:
+    """What smooth courses of time in the place of its channel say of a candidate, or of the field if it lags that; of
+    one without either nothing."""
+    before, model = candidate.before or state, candidate.model
+    x = before.excitation
+    name = _followed(model, x)
+    if not name or candidate.moved is not None:
+        return BesideTime(True)
+    residual, given = thinned(before, REFINING_SAMPLES)
+    held = [] if given is None else [given]
+    own = _with_slopes(candidate, x).at(residual.samples)
+    courses = _of_time(model, x, name).at(residual.samples)
+    every = joined([*held, own, courses])
+    left = taken_off(residual, every, estimated(residual, every, WHITE).theta)
+    colours = colours_of(left, stiff=True, above=FIRST_LEFT)
+
+    def explains(*terms: Terms) -> float:
+        return explained(estimated(residual, joined([*held, *terms]), colours))
+
+    both = explains(own, courses)
+    if _chance(both - explains(courses), own.count) < SEEN:
+        return BesideTime(True)
+    if candidate.assessment.gain.total <= MISSED * explained_by_courses(state, candidate):
+        return BesideTime(False, f"{name} explains nothing beside smooth courses of time, and a drift is adopted")
+    if _chance(both - explains(own), courses.count) < MORE:
+        return BesideTime(False, f"smooth courses of time explain more than {name}, and leave it nothing")
+    return BesideTime(False)
+
+
+def rivals_in_time(candidate: Candidate, possible: Sequence[Candidate], state: State) -> set[str]:
+    """The models of what drifts or settles most of which a candidate predicts as well."""
+    of_time = (c for c in possible if TIME in drivers(c.model, state.excitation) and not happens_once(c.model))
+    return {c.model.name for c in of_time if c is not candidate and overlaps(c, candidate, state)}
+
+
+def _followed(model: Adopted, x: Excitation) -> str:
+    """What a response follows: its channel, or the field if it lags that; "" for no response, and for a vector."""
+    channels = channels_of(model, x)
+    if not channels:
+        return "" if beginning(model.component, model.settings) is None else THE_FIELD
+    (name, *others) = channels
+    return "" if others or x.is_vector(name) else name
+
+
+def _with_slopes(candidate: Candidate, x: Excitation) -> Terms:
+    """A candidate's terms, and how what they explain changes with its settings on a range, which are not at their best
+    yet: a thousandth of them is more than noise beside a large effect."""
+    model, theta = candidate.model, candidate.assessment.theta[-candidate.terms.count :]
+    outputs = 3 * len(x.sensors)
+    here = model.terms(x)
+    slopes = []
+    for name, grid in profiled(model.component).items():
+        if isinstance(grid, (Range, Beginning)) and model.settings[name]:
+            moved = replace(model, settings={**model.settings, name: (1.0 + STEP) * model.settings[name]})
+            change = moved.terms(x).contribution(theta, outputs) - here.contribution(theta, outputs)
+            slopes.append(one_pattern(change / STEP, name))
+    return joined([here, *slopes])
+
+
+def _of_time(model: Adopted, x: Excitation, name: str) -> Terms:
+    """What a model makes of smooth courses of time in the place of its channel; of the field, offsets."""
+    part = (x.time - x.time[0]) / max(x.duration, 1e-300)
+    courses = np.polynomial.legendre.legvander(2.0 * np.sqrt(part) - 1.0, COURSES)[:, 1:]
+    if name == THE_FIELD:
+        return joined([x.offsets(course, "nT") for course in courses.T])
+    settings = _plain(model)
+    shape = x.logged[name].shape
+    made = []
+    for course in courses.T:
+        logged = np.broadcast_to(course.reshape(-1, *(1,) * (len(shape) - 1)), shape)
+        seen = replace(x, logged={**x.logged, name: logged}, courses={})
+        made.append(replace(model, settings=settings).terms(seen))
+    return joined(made)
+
+
+def _plain(model: Adopted) -> Mapping[str, Any]:
+    """Its settings with the first power of the channel, without a lag where there may be none."""
+    found = dict(model.settings)
+    for setting, grid in profiled(model.component).items():
+        if isinstance(grid, Beginning) or (isinstance(grid, Range) and grid.low <= 0.0):
+            found[setting] = 0.0
+        elif isinstance(grid, Orders) or (isinstance(grid, Choice) and not isinstance(grid.options[0], bool)):
+            found[setting] = grid.options[0]
+    return found
+
+
+def _chance(explained: float, coefficients: int) -> float:
+    """Probability that so many coefficients explain as much of noise of unit variance."""
+    from scipy.special import chdtrc
+
+    return float(chdtrc(max(coefficients, 1), max(explained, 0.0)))

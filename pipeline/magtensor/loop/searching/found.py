@@ -1,0 +1,67 @@
+"""What a search has found: its rounds, and where it ended."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from magtensor.loop.fitting.model import Fitting, Record, State
+from magtensor.loop.searching.gates import Candidate
+from magtensor.loop.searching.latent import Sought
+
+
+@dataclass(frozen=True)
+class Step:
+    """One round of the search: what was looked at and what was done.
+
+    Attributes:
+        before: state before; candidates: by held-out gain, best first.
+        adopted: the candidate adopted, None where none was.
+        rivals: names of models that the data do not separate from it.
+        dropped: models dropped after the refit.
+        refused: model -> why it was not kept after it had been fitted.
+        among: the sensors looked at, where some that wander were left out; () where all were.
+        channels: others that the data do not separate from the one that it follows.
+        screened: names of the models that were tried with every setting, those looked at closely among them.
+    """
+
+    before: State
+    candidates: tuple[Candidate, ...]
+    adopted: Candidate | None
+    rivals: tuple[str, ...] = ()
+    dropped: tuple[str, ...] = ()
+    refused: Mapping[str, str] = field(default_factory=dict)
+    among: tuple[str, ...] = ()
+    channels: tuple[str, ...] = ()
+    screened: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Search:
+    """The whole search.
+
+    Attributes:
+        first, last: states with the declared model and with all that was adopted.
+        steps: in order.
+        not_tested: model -> what the survey lacks for it.
+        failed: model -> why its regressors could not be made.
+        record: the samples, with the waveform of a source that nobody logged where one was adopted.
+        shared: the waveform that the sensors share after all that was adopted; None where it cannot be asked for.
+        how: how the fit of the last state was made.
+        evenly: that state with the sensors weighed by their white noise, where they were weighed by all (`wandering`).
+    """
+
+    first: State
+    last: State
+    steps: tuple[Step, ...]
+    not_tested: Mapping[str, tuple[str, ...]]
+    failed: Mapping[str, str]
+    record: Record
+    shared: Sought | None
+    how: Fitting
+    evenly: State | None = None
+
+    @property
+    def told(self) -> State:
+        """The state by which it is told what is left."""
+        return self.evenly or self.last

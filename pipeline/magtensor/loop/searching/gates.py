@@ -1,0 +1,186 @@
+"""The first two gates: what an error model has to show before anything is fitted anew."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from magtensor.error_models.settings import AnyChannel, profiled
+from magtensor.error_models.terms import REFERENCE, Terms, joined
+from magtensor.loop.evidence.assessment import BORNE_OUT, Assessment
+from magtensor.loop.evidence.residual import taken_off
+from magtensor.loop.fitting.model import Adopted, State
+from magtensor.loop.searching.contribution import a_tone, happens_once
+
+ALPHA = 0.005  # family-wise probability that a clean survey gets an adoption, before the second gate
+SECOND_ORDER = 1e-5  # of the sum of squares that is explained: 0.3 % of an effect's size
+OF_THE_LAW = 0.0025  # the same, that the law of an effect may miss: 5 % of its size
+LEAST_REDUCTION = 1e-4  # of the held-out sum of squares: smaller is significant only in very long surveys
+LOG_MARGIN = 1.5  # the noise of a log is known to some per cent
+LOG_DEVIATIONS = 3.0  # of what coefficients gain of it by chance
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """An error model with settings, looked at closely.
+
+    Attributes:
+        model: component and settings.
+        tried: independent tests that the settings tried for it amount to, for the correction of its p value.
+        terms: at the residual's samples.
+        assessment: of the terms, given the models adopted before.
+        adjusted_p: after the correction for settings and for the number of models.
+        adjusted_own_p: the same in noise of each sensor's own spectrum.
+        adjusted_null_p: the same for what it explains in noise of the residual's own colour.
+        alpha: what the adjusted p has to stay below.
+        log_noise: what noise in the log of its channel, brought in by a model adopted before, lets it gain.
+        beside: sum of squares that the models adopted before explain to first order; kin: the same of those that have
+            its sensors and what drives it (`kin`).
+        before: what it was judged against, where that is the fit with it, its part put back (`own_fit`).
+        moved: the place of an adopted model that takes other settings beside it, and that model with these (`split`);
+            `terms` are of both then, the one that takes other settings first.
+    """
+
+    model: Adopted
+    tried: float
+    terms: Terms
+    assessment: Assessment
+    adjusted_p: float
+    adjusted_own_p: float
+    adjusted_null_p: float
+    alpha: float = ALPHA
+    log_noise: float = 0.0
+    beside: float = 0.0
+    kin: float = 0.0
+    before: State | None = None
+    moved: tuple[int, Adopted] | None = None
+
+    def among(self, models: int) -> Candidate:
+        """The same, found among so many models rather than by itself."""
+        each = self.adjusted_p, self.adjusted_own_p, self.adjusted_null_p
+        p, own_p, null_p = (min(1.0, value * max(models, 1)) for value in each)
+        return replace(self, adjusted_p=p, adjusted_own_p=own_p, adjusted_null_p=null_p)
+
+    @property
+    def of_the_log(self) -> bool:
+        """Whether noise in the log of a channel explains what it gains."""
+        return 0.0 < self.assessment.gain.total <= gained_of_a_log(self.log_noise, self.assessment.estimate.rank)
+
+    @property
+    def of_second_order(self) -> bool:
+        """Whether it is so small beside what is adopted that the next order of that explains as much.
+
+        Every effect is described to first order, with logs that err: an attitude by a tenth of a degree is an error of
+        0.2 % of a gradient.
+        """
+        return 0.0 < self.assessment.gain.total <= SECOND_ORDER * self.beside
+
+    @property
+    def of_the_law(self) -> bool:
+        """Whether it is no more than the law of an adopted effect, which has its driver and its sensors, may miss."""
+        return 0.0 < self.assessment.gain.total <= OF_THE_LAW * self.kin
+
+    @property
+    def significant(self) -> bool:
+        """Whether noise does not explain it, all that was tried considered.
+
+        By its p value alone. Or, because a dozen long blocks tell little of what is very unlikely, in noise of each
+        sensor's own spectrum, if the blocks bear it out: as a test of this model alone where it is added to the axes,
+        among all models where it turns with the field, for noise that turns with it (a mount that creeps) has no
+        spectrum. The p value of what happens once is not from blocks, and of a tone that spectrum does not know that
+        its strongest line was taken.
+        """
+        if self.adjusted_p < self.alpha:
+            return True
+        if happens_once(self.model) or a_tone(self.model):
+            return False
+        by_blocks = self.assessment.p * self.tried if adds_to_axes(self.terms) else self.adjusted_p
+        return self.adjusted_own_p < self.alpha and by_blocks < BORNE_OUT
+
+    @property
+    def beyond_slow_noise(self) -> bool:
+        """Whether noise of the colour that the residual has without the model, all of it taken for noise, does not
+        explain what the model does: it predicts held-out blocks even so, or that much would be too unlikely.
+
+        What happens once, at the beginning or end, is seen by few blocks, and the others cannot predict it closely
+        enough in noise so strong.
+        """
+        return self.assessment.null_gain.total > 0 or self.adjusted_null_p < self.alpha
+
+    @property
+    def predicts(self) -> bool:
+        """Whether it is significant and predicts held-out blocks, in noise of the colour of what it leaves."""
+        if self.of_the_log or self.of_second_order or self.of_the_law:
+            return False
+        gain = self.assessment.gain
+        reduction = gain.total / max(float(gain.before.sum()), 1e-300)
+        return self.significant and (gain.consistent or self.predicts_where_it_acts) and reduction > LEAST_REDUCTION
+
+    @property
+    def predicts_where_it_acts(self) -> bool:
+        """Whether a model that acts in a part of the survey only predicts one part of that from the others.
+
+        Then the folds of equal length are but one or two figures, which may gain much and tell no scatter. The short
+        folds in which it acts are not asked unless its p value and that in noise of the residual's own colour pass, and
+        in noise of that colour it has to predict them as well. Only of what happens once or follows a channel: a
+        drift is everywhere, and short folds at its end say no more than that neighbours are alike.
+        """
+        channel = any(isinstance(grid, AnyChannel) for grid in profiled(self.model.component).values())
+        if not channel and not happens_once(self.model):
+            return False
+        focused, null = self.assessment.focused, self.assessment.null_focused
+        if focused is None or null is None or self.assessment.gain.total <= 0:
+            return False
+        unlikely = self.adjusted_p < self.alpha and self.adjusted_null_p < self.alpha
+        return unlikely and focused.consistent and null.total > 0
+
+    @property
+    def passes(self) -> bool:
+        """Both gates."""
+        return self.predicts and self.beyond_slow_noise
+
+
+def adds_to_axes(terms: Terms) -> bool:
+    """Whether every series of regressors is added to all axes of a sensor alike, or to the reference: what turns with
+    the field is another one in each axis."""
+    if not np.all(terms.part_weight == 1.0):
+        return False
+    raw = terms.part_output != REFERENCE
+    touched = {(s, o) for s, o in zip(terms.part_series[raw].tolist(), terms.part_output[raw].tolist(), strict=True)}
+    return all((s, 3 * (o // 3) + axis) in touched for s, o in touched for axis in range(3))
+
+
+def gained_of_a_log(log_noise: float, coefficients: float) -> float:
+    """The most that coefficients gain of noise in the log of a channel, whose sum of squares is given; 0 of none.
+
+    Beside the noise of the sensors that is a chi-square with so many degrees of freedom whose noncentrality is the sum.
+    """
+    if log_noise <= 0:
+        return 0.0
+    scatter = LOG_DEVIATIONS * float(np.sqrt(2.0 * coefficients + 4.0 * log_noise))
+    return max(LOG_MARGIN * log_noise, log_noise + coefficients + scatter)
+
+
+def explained_before(state: State) -> float:
+    """Sum of squares of the whitened residual that the adopted models explain together to first order.
+
+    Delays, which are taken off to all orders, have no part in it."""
+    return explained_by(state, range(len(state.adopted)))
+
+
+def explained_by(state: State, places: Sequence[int]) -> float:
+    """The same of some of the adopted models."""
+    residual = state.residual
+    first_order = [
+        (terms.at(residual.samples), state.theta[place])
+        for place in places
+        if (terms := state.adopted[place].terms(state.excitation)).delay is None
+    ]
+    if not first_order:
+        return 0.0
+    back = taken_off(
+        residual, joined([terms for terms, _ in first_order]), -np.concatenate([t for _, t in first_order])
+    )
+    return max(back.square() - residual.square(), 0.0) * len(residual.affine) * residual.freedom

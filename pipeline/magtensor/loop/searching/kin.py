@@ -1,0 +1,65 @@
+"""What a candidate has in common with an adopted effect: the sensors, and what drives both.
+
+The law of an effect holds to some per cent: a scale factor that follows the temperature may turn with it a little, an
+axis that leans takes its share of a drift. What follows the same channel, or goes with time as well, on the same
+sensors, and is that small beside it, is more of the same and no second cause.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from magtensor.error_models.excitation import Excitation
+from magtensor.error_models.settings import Duration, EventTimes, Range, profiled
+from magtensor.error_models.terms import Terms
+from magtensor.loop.evidence.assessment import NEARLY_ALL, Assessment
+from magtensor.loop.fitting.log_noise import channels_of
+from magtensor.loop.fitting.model import Adopted, State
+from magtensor.loop.searching.gates import Candidate, explained_by
+
+TIME = " time"  # no channel has that name
+
+
+def explained_by_kin(state: State, model: Adopted, terms: Terms, assessment: Assessment) -> float:
+    """Sum of squares that adopted effects of another name explain which have the candidate's sensors and driver."""
+    return _explained(state, drivers(model, state.excitation), model.name, terms, assessment)
+
+
+def explained_by_courses(state: State, candidate: Candidate) -> float:
+    """Sum of squares that adopted effects explain which go with time and have the candidate's sensors."""
+    return _explained(state, {TIME}, candidate.model.name, candidate.terms, candidate.assessment)
+
+
+def _explained(state: State, by: set[str], name: str, terms: Terms, assessment: Assessment) -> float:
+    kin = [
+        place
+        for place, other in enumerate(state.adopted)
+        if other.name != name
+        and by & drivers(other, state.excitation)
+        and _held_by(other.sensors or state.excitation.sensors, state, terms, assessment) > NEARLY_ALL
+    ]
+    return explained_by(state, kin) if kin else 0.0
+
+
+def drivers(model: Adopted, x: Excitation) -> set[str]:
+    """The channels that a model follows, and `TIME` of what drifts, warms up or happens once."""
+    found = channels_of(model, x) | {need for need in model.component.declared({}).needs if need in x.logged}
+    return found | ({TIME} if any(map(_of_time, profiled(model.component).values())) else set())
+
+
+def _of_time(grid: Any) -> bool:
+    """A setting that times of the survey, or parts of it, are chosen for."""
+    return isinstance(grid, (Duration, EventTimes)) or (isinstance(grid, Range) and grid.of_duration)
+
+
+def _held_by(sensors: Sequence[str], state: State, terms: Terms, assessment: Assessment) -> float:
+    """The share of what a candidate explains that its coefficients for some of the sensors hold."""
+    theta = assessment.estimate.theta[-terms.count :]
+    normal = assessment.estimate.normal[-terms.count :, -terms.count :]
+    every = theta @ normal @ theta
+    mine = np.array([s in sensors for s in terms.sensors])
+    held = np.where(mine, theta, 0.0)
+    return float(held @ normal @ held / every) if every > 0 else 0.0

@@ -1,0 +1,431 @@
+"""A source nobody logged: one waveform, a vector at each sensor.
+
+What lies across the plane that all sensors share is noise of each sensor, unless something moves several of them in
+step. The test is one of factor analysis (`factor`): does the covariance of the residual, in bands of the lowest
+frequencies, ask for a factor beside noise of the sensors, of any level and correlation within one? Its proof is
+prediction: in a stretch of time each sensor's residual from that of the others, through a direction found in the other
+stretches. Two sensors have one contrast: which of them was disturbed cannot be told, so nothing is adopted.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magtensor.calibration.types import Array
+from magtensor.components import Component
+from magtensor.error_models.direction import attitude_series
+from magtensor.error_models.terms import joined
+from magtensor.error_models.waveform import NAME, Course, course_of, free_directions
+from magtensor.loop.evidence.assessment import Assessment, estimated
+from magtensor.loop.evidence.colour import beside_the_field
+from magtensor.loop.evidence.factor import Factors, Groups, noise_alone, refitted, with_factor
+from magtensor.loop.evidence.residual import Residual
+from magtensor.loop.evidence.statistics import FOLDS, Gain
+from magtensor.loop.fitting.log_noise import brought_in
+from magtensor.loop.fitting.model import Adopted, Fitting, Record, State
+from magtensor.loop.fitting.refit import joint_state
+from magtensor.loop.searching.gates import OF_THE_LAW, Candidate, explained_before, gained_of_a_log
+from magtensor.loop.searching.likeness import effect_along, followed
+
+ALPHA = 0.001  # family-wise over the bands
+LEAST_SENSORS = 3  # from here on noise of single sensors does not imitate a factor
+LEAST_BAND = 6  # coefficients of the lowest band for each value across
+_PARTS = 6  # of a band, in which the noise of different values may have different power
+QUIET = 5.0  # times the median square of a step: of a few dozen values none is as large by chance
+LEVEL_ROUNDS = 3
+LEAST_NOISE = 0.1  # of what the fit believes
+SINGLE_STRETCH = "it acts in a single short stretch, which no other can confirm"
+ONCE = 0.9  # of a waveform's power in a stretch as long as one that is held out
+SECOND = 0.1  # a second factor this strong beside the first: not one waveform
+
+
+@dataclass(frozen=True)
+class Sought:
+    """The strongest waveform that the sensors share, and what speaks for it and against it.
+
+    Attributes:
+        time: (N,) s; values: (N,) of unit rms; std: of a value.
+        direction: (S, 3) nT per unit at each sensor, as far as it shows off the common plane.
+        period_s: the shortest period in it.
+        p: that noise of the sensors alone gives so strong a one, all bands considered.
+        share: of the variance across that it explains, within 0 and 1: what C and o have taken of it is not there.
+        gain: on held-out stretches, of each sensor's whitened residual predicted from the others.
+        like: channel, lag s, power and correlation of the channel it follows; None where it follows none.
+        switches: whether it has two levels.
+        of_the_log: whether noise in the logs of adopted channels explains it.
+        objection: why it is not adopted; "" where nothing stands against it.
+        left_by: the adopted effect that may leave it, or have taken a part of it; "" where there is none.
+    """
+
+    time: Array
+    values: Array
+    std: float
+    direction: Array
+    period_s: float
+    p: float
+    share: float
+    gain: Gain
+    like: tuple[str, float, int, float] | None
+    switches: bool
+    of_the_log: bool
+    objection: str
+    left_by: str = ""
+
+    @property
+    def significant(self) -> bool:
+        """Whether it is there."""
+        return self.p < ALPHA and not self.of_the_log
+
+
+def sought(state: State, record: Record, *, may_follow: bool = False) -> Sought | None:
+    """Look for a waveform that the sensors share; None where there are too few sensors or samples to ask.
+
+    Parameters
+    ----------
+    may_follow: whether the waveform may resemble a logged channel, one that was tried and does not explain it.
+    """
+    state = state.unabridged
+    residual = state.residual
+    if residual.across is None:
+        return None
+    held = np.eye(len(residual.noise)) - residual.projector
+    adopted = _put_back(state)
+    if adopted is not None:  # its own noise went with it
+        held = np.column_stack([held, residual.projector @ adopted[1]])
+    basis = free_directions(held)
+    n, m = len(residual.across), basis.shape[1]
+    if n <= LEAST_BAND * m:
+        return None
+    sensors = len(residual.noise) // 3
+    told = sensors >= LEAST_SENSORS
+    groups: Groups = [np.arange(3 * s, 3 * s + 3) for s in range(sensors)] if told else _outputs(basis)
+    z, colour = beside_the_field(residual.across @ basis, residual.affine)
+    test = _strongest(colour.whiten(z), basis, groups)
+    factors = with_factor(test.covariance, basis, groups, test.alone)
+    course = _told_from_the_field(residual, held, factors.direction)
+    if course.rms == 0:
+        return None
+    seen = basis.T @ factors.direction * course.rms
+    time = record.time[residual.samples]
+    values = course.values / course.rms
+    inside = lowest(z, test.band)
+    gain = _predicted(inside, z - inside, basis, groups)
+    like = followed(time, values, record)
+    objection = left_by = ""
+    if not told:
+        objection = "with two sensors it cannot be told from a disturbance of one of them"
+    elif n * float(seen @ seen) <= OF_THE_LAW * explained_before(state):
+        objection = "it is less than 5 % of what is adopted, whose laws may leave it"
+    elif not gain.consistent:
+        objection = "the sensors do not predict each other with it on held-out stretches"
+    elif like is not None and not may_follow:
+        objection = f"its waveform follows channel {like[0]}"
+    elif left_by := effect_along(state, basis, seen):
+        objection = f"the sensors feel it as they feel {left_by}, which may leave it"
+    elif _acts_once(values):
+        objection = SINGLE_STRETCH
+    elif _second(test, basis, factors) > SECOND:
+        objection = "one waveform does not explain what the sensors share"
+    return Sought(
+        time=time,
+        values=values,
+        std=course.std / course.rms,
+        direction=(basis @ seen * residual.noise).reshape(-1, 3),
+        period_s=float(np.median(np.diff(time))) / max(course.band, 0.5 / n),
+        p=test.p,
+        share=_share(residual, z, values, seen),
+        gain=gain,
+        like=like,
+        switches=course.switches,
+        of_the_log=gain.total <= gained_of_a_log(brought_in(state), len(seen)),
+        objection=objection,
+        left_by=left_by,
+    )
+
+
+def _acts_once(values: Array) -> bool:
+    """Whether a waveform (N,) is hardly more than one burst: a few bad rows of a recorder are one to all sensors."""
+    power = np.cumsum((values - np.median(values)) ** 2)
+    length = max(len(values) // FOLDS, 1)
+    return bool(np.max(power[length:] - power[:-length], initial=power[length - 1]) > ONCE * power[-1])
+
+
+@dataclass(frozen=True)
+class Source:
+    """An adopted source: the record with its waveform, the calibration with it, and the evidence."""
+
+    record: Record
+    after: State
+    evidence: Candidate
+
+
+def tried_source(
+    component: Component, record: Record, state: State, found: Sought, how: Fitting, alpha: float
+) -> tuple[Sought, Source | None]:
+    """What was found, with a last objection if there is one, and the calibration with it if there is none.
+
+    Parameters
+    ----------
+    component: the error model.
+    alpha: family-wise false-alarm probability.
+    """
+    if found.objection or not found.significant or found.p >= alpha:
+        return found, None
+    record = replace(record, waveform=np.interp(record.time, found.time, found.values))
+    model = Adopted(component, {})
+    every = model.terms(replace(state.excitation, waveform=record.waveform))
+    terms = every.at(state.residual.samples)
+    together = terms if state.terms is None else joined([terms, state.terms])
+    estimate = estimated(state.residual, together, state.colours)
+    after = joint_state(record, [*state.adopted, model], how, [*state.theta, np.zeros(every.count)])
+    record, after = renewed(record, after, how)
+    if _turning(record, after):
+        return replace(found, objection="its waveform follows the direction of the field"), None
+    model = Adopted(component, {"noise_nT": [float(v) for v in _own_noise(after)]})
+    after = replace(after, adopted=(*after.adopted[:-1], model))
+    gain = found.gain
+    evidence = Assessment(estimate, gain, gain, None, None, found.p, found.p, found.p, state.colours, estimate.theta)
+    return found, Source(record, after, Candidate(model, 1, terms, evidence, found.p, found.p, found.p, ALPHA))
+
+
+def _own_noise(state: State) -> Array:
+    """(3 S,) nT, white noise of the outputs beside an adopted source.
+
+    From differences of neighbouring samples in which the source is left: its waveform, one value a sample, has taken
+    with it the most of the noise of those outputs that feel it most.
+    """
+    found = _put_back(state)
+    assert found is not None
+    basis = free_directions(np.eye(len(state.residual.noise)) - state.residual.projector)
+    steps = np.diff(found[0] @ basis, axis=0) / np.sqrt(2.0)
+    size = np.sum(steps**2, axis=1)
+    quiet = steps[size < QUIET * np.median(size)]  # where it does not switch
+    alone = noise_alone(quiet.T @ quiet / len(quiet), basis, _outputs(basis))
+    out: Array = state.residual.noise * np.sqrt(np.maximum(np.diag(alone.noise), LEAST_NOISE**2))
+    return out
+
+
+def _told_from_the_field(residual: Residual, held: Array, direction: Array) -> Course:
+    """The waveform in a residual whose fit took some of it for the field.
+
+    Where the source is strong, C and o have followed it along its direction. What of it goes with the field is told
+    apart by its colour: generalised least squares, the colour found anew when that part has gone.
+    """
+    assert residual.across is not None
+    free = free_directions(held)
+    seen = free @ (free.T @ direction)
+    series = residual.across @ seen / (seen @ seen)
+    left, _ = beside_the_field(series, residual.affine)
+    return course_of(residual.across + np.outer(left - series, seen), held, direction)
+
+
+def renewed(record: Record, state: State, how: Fitting) -> tuple[Record, State]:
+    """The waveform once more, from a calibration that knows the source or another effect better, and a refit."""
+    every = state.unabridged
+    found = _put_back(every)
+    if found is None:
+        return record, state
+    across, direction = found
+    course = _course_beside_the_field(across, np.eye(len(direction)) - every.residual.projector, direction, every)
+    if course.rms == 0:
+        return record, state
+    waveform = np.interp(record.time, record.time[every.residual.samples], course.values / course.rms)
+    record = replace(record, waveform=waveform)
+    return record, joint_state(record, state.adopted, how, state.theta, state.lines)
+
+
+def _course_beside_the_field(across: Array, held: Array, direction: Array, state: State) -> Course:
+    """The waveform as in `course_of`; if it is one of two levels once what goes with the field has gone, that.
+
+    What C lacks along the source's vectors is in its waveform, where one that may be anything keeps it. The levels of
+    one that switches tell it: then C takes it back.
+    """
+    course = course_of(across, held, direction)
+    if course.switches or course.rms == 0:
+        return course
+    free = free_directions(held)
+    seen = free.T @ direction
+    series, affine = across @ free @ seen / float(seen @ seen), state.residual.affine
+    on = course.values > 0.5 * (course.values.min() + course.values.max())
+    part = np.zeros(len(series))
+    for _ in range(LEVEL_ROUNDS):
+        *field, step = np.linalg.lstsq(np.column_stack([affine, on]), series, rcond=1e-12)[0]
+        part = affine @ np.array(field)
+        on = (series - part) / step > 0.5 if step else on
+    levels = course_of(across - np.outer(part - part.mean(), direction), held, direction)
+    return levels if levels.switches else course
+
+
+def _share(residual: Residual, z: Array, values: Array, direction: Array) -> float:
+    """The part of the variance of z (N, m) that a waveform (N,) explains along a direction (m,)."""
+    left = values - residual.affine @ np.linalg.lstsq(residual.affine, values, rcond=1e-12)[0]
+    along = z @ direction
+    whole = float(left @ left) * float(direction @ direction) * float(np.sum(z**2))
+    return float(left @ along) ** 2 / whole if whole else 0.0
+
+
+def _put_back(state: State) -> tuple[Array, Array] | None:
+    """The whitened residual across (N, 3 S) with the adopted source left in it, and its direction (3 S,)."""
+    which = next((i for i, a in enumerate(state.adopted) if a.name == NAME), None)
+    if which is None:
+        return None
+    residual, theta = state.residual, state.theta[which]
+    assert residual.across is not None
+    size = len(residual.noise)
+    added = state.adopted[which].terms(state.excitation).at(residual.samples).contribution(theta, size)
+    return residual.across + added / residual.noise @ residual.projector, theta / residual.noise
+
+
+@dataclass(frozen=True)
+class _Test:
+    """The band that speaks most clearly against noise of the groups alone."""
+
+    band: int
+    covariance: Array
+    alone: Factors
+    p: float
+
+
+def _strongest(white: Array, basis: Array, groups: Groups) -> _Test:
+    """The test in the lowest 1/2^k of the cosine coefficients of (N, m), for all k that leave enough of them."""
+    from scipy.fft import dct
+
+    n, m = white.shape
+    coefficients = dct(white, axis=0, norm="ortho")
+    count = int(np.log2((n - 1) / (LEAST_BAND * m)))
+    bands = sorted({LEAST_BAND * m * 2**k for k in range(count + 1)} | {n - 1})
+    tests = []
+    for band in bands:
+        own = coefficients[1 : band + 1]
+        covariance = own.T @ own / band
+        alone = noise_alone(covariance, basis, groups)
+        p = min(1.0, float(np.exp(alone.log_p(_effective(own, covariance)))) * len(bands))
+        tests.append(_Test(band, covariance, alone, p))
+    return max(tests, key=lambda t: t.band * t.alone.deviance)
+
+
+def _effective(coefficients: Array, covariance: Array) -> float:
+    """How many coefficients of one colour tell as much: fewer than (K, m) where the values differ in colour.
+
+    The covariance of two independent series of powers p and q over frequency varies as the mean of p q does.
+    """
+    values, vectors = np.linalg.eigh(covariance)
+    unit = coefficients @ (vectors / np.sqrt(np.maximum(values, 1e-12 * values[-1])))
+    power = np.stack([np.mean(part**2, axis=0) for part in np.array_split(unit, _PARTS)])
+    products = power.T @ power / _PARTS
+    m = len(covariance)
+    alike = (products.sum() - np.trace(products)) / (m * (m - 1))
+    return len(coefficients) / max(alike, 1.0)
+
+
+def lowest(series: Array, band: int) -> Array:
+    """(N, K) without its mean and all cosine coefficients above the lowest ones."""
+    from scipy.fft import dct, idct
+
+    coefficients = dct(series, axis=0, norm="ortho")
+    coefficients[0] = 0.0
+    coefficients[band + 1 :] = 0.0
+    out: Array = idct(coefficients, axis=0, norm="ortho")
+    return out
+
+
+def _outputs(basis: Array) -> Groups:
+    return [np.array([i]) for i in range(len(basis))]
+
+
+def _second(test: _Test, basis: Array, factors: Factors) -> float:
+    """Strength of a second factor beside the first; zero where noise may make it."""
+    alone = test.alone
+    if factors.freedom == 0:  # three sensors: only noise of each output alone leaves anything to disagree
+        alone = noise_alone(test.covariance, basis, _outputs(basis))
+        factors = with_factor(test.covariance, basis, _outputs(basis), alone)
+    if factors.log_p(test.band) > np.log(ALPHA):
+        return 0.0
+    first = alone.deviance - factors.deviance - (alone.freedom - factors.freedom) / test.band
+    second = factors.deviance - factors.freedom / test.band
+    return second / max(first, 1e-300)
+
+
+def _predicted(inside: Array, outside: Array, basis: Array, groups: Groups) -> Gain:
+    """Squares of each sensor's whitened residual as the others predict it, in stretches that the model has not seen.
+
+    Before: the noise of the sensors, with all that it lets them know of each other. After: with the factor. What is
+    outside the band is in both.
+    """
+    n = len(inside)
+    edges = np.linspace(0, n, FOLDS + 1).round().astype(int)
+    sums = np.stack([inside[a:b].T @ inside[a:b] for a, b in itertools.pairwise(edges)])
+    split = [_own_and_others(basis, group) for group in groups]
+    total = sums.sum(axis=0)
+    noise = noise_alone(total / n, basis, groups)
+    whole = with_factor(total / n, basis, groups, noise)
+    before, after = np.zeros(FOLDS), np.zeros(FOLDS)
+    for k, (a, b) in enumerate(itertools.pairwise(edges)):
+        train = (total - sums[k]) / (n - (b - a))
+        alone, factors = (refitted(train, basis, groups, near) for near in (noise, whole))
+        for own, others in split:
+            rest = float(np.sum((outside[a:b] @ own) ** 2))
+            before[k] += rest + _error(alone.covariance, sums[k], own, others)
+            after[k] += rest + _error(factors.covariance, sums[k], own, others)
+    return Gain(before, after, np.diff(edges) * float(sum(own.shape[1] for own, _ in split)))
+
+
+def _own_and_others(basis: Array, group: NDArray[np.int_]) -> tuple[Array, Array]:
+    """Directions (m, k) that a group of outputs moves, and those (m, m - k) that it does not."""
+    u, s, _ = np.linalg.svd(basis[group].T, full_matrices=True)
+    return u[:, : len(s)], u[:, len(s) :]
+
+
+def _error(model: Array, sums: Array, own: Array, others: Array) -> float:
+    """Sum of squares of `own` less what a model's covariance predicts of it from `others`."""
+    through = np.linalg.solve(others.T @ model @ others, others.T @ model @ own)
+    left = own - others @ through
+    return float(np.sum(left * (sums @ left)))
+
+
+def _turning(record: Record, state: State) -> bool:
+    """Whether the attitude predicts an adopted source in stretches that its coefficients have not seen.
+
+    Beyond the field itself, whose part C has taken. Asked when the source is known, for until then it is in the field
+    too, and what differs between that and a logged attitude follows the source.
+    """
+    found = _put_back(state)
+    assert found is not None
+    across, direction = found
+    series = across @ direction
+    columns = np.column_stack([state.residual.affine, attitude_series(state.excitation)[state.residual.samples]])
+    n = len(series)
+    if n < 4 * columns.shape[1]:
+        return False
+    edges = np.linspace(0, n, FOLDS + 1).round().astype(int)
+    loss = np.zeros((2, FOLDS))
+    for k, (a, b) in enumerate(itertools.pairwise(edges)):
+        train = np.r_[0:a, b:n]
+        for i, some in enumerate((columns[:, :4], columns)):
+            theta = np.linalg.lstsq(some[train], series[train], rcond=1e-9)[0]
+            loss[i, k] = np.sum((series[a:b] - some[a:b] @ theta) ** 2)
+    return Gain(loss[0], loss[1], np.diff(edges).astype(float)).consistent
+
+
+def shared_words(found: Sought, sensors: Sequence[str]) -> str:
+    """A waveform that the sensors share, in words."""
+    strength = np.sqrt(np.sum(found.direction**2, axis=1))
+    each = ", ".join(f"{s} {a:.2g} nT" for s, a in zip(sensors, strength, strict=True))
+    course = "switches between two levels" if found.switches else f"has periods from {found.period_s:.2g} s on"
+    part = f"{found.share:.0%}" if found.share >= 0.01 else "less than 1%"
+    words = (
+        f"the sensors share one waveform ({each}; {part} of the variance of what differs between them), which {course}"
+    )
+    if found.like is not None:
+        name, lag, power, correlation = found.like
+        to_the = "" if power == 1 else f" to the power {power}"
+        return words + (
+            f" and is most like channel {name}{to_the} with a lag of {lag:.3g} s (correlation {correlation:+.2f})"
+        )
+    words += " and follows no logged channel"
+    return words + (f"; not adopted: {found.objection}" if found.objection else "")

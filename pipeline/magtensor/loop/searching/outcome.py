@@ -1,0 +1,178 @@
+"""The search as `verdict.json` tells it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from magtensor.error_models.settings import Beginning, EventTimes, Forms, Frequencies, Range, profiled
+from magtensor.error_models.waveform import NAME
+from magtensor.loop.fitting.model import Adopted, Record
+from magtensor.loop.searching.contribution import happens_once, removal
+from magtensor.loop.searching.found import Search, Step
+from magtensor.loop.searching.gates import Candidate
+
+
+def described(found: Search, record: Record, declared: int) -> dict[str, Any]:
+    """`adopted`, `rejected` and `not_tested` of the contract, and `steps`: each round of the search.
+
+    Args:
+        found: the search.
+        record: its samples.
+        declared: how many of the error models were declared and are no discovery.
+    """
+    return {
+        "adopted": [_adopted(found, i) for i in range(declared, len(found.last.adopted))],
+        "rejected": _rejected(found),
+        "not_tested": [
+            {"error_model": name, "missing": list(missing)} for name, missing in sorted(found.not_tested.items())
+        ],
+        "steps": [_step(number, step) for number, step in enumerate(found.steps, 1)],
+    }
+
+
+def _step(number: int, step: Step) -> dict[str, Any]:
+    return {
+        "round": number,
+        "adopted": None if step.adopted is None else step.adopted.model.name,
+        "indistinguishable_from": list(step.rivals),
+        "dropped": list(step.dropped),
+        "refused": dict(step.refused),
+        **({"among": list(step.among)} if step.among else {}),
+        "looked_at": [
+            judgement(c) | {"why": "adopted" if c is step.adopted else why(c, step.adopted)} for c in step.candidates
+        ],
+    }
+
+
+def judgement(candidate: Candidate) -> dict[str, Any]:
+    """What was found of one error model, and whether the first two gates let it pass."""
+    gain, focused = candidate.assessment.gain, candidate.assessment.focused
+    return {
+        "error_model": candidate.model.name,
+        "settings": _settings(candidate.model),
+        "p": candidate.adjusted_p,
+        "held_out_gain": float(gain.total),
+        "t": float(gain.t),
+        "t_where_it_acts": None if focused is None else float(focused.t),
+        "passes": bool(candidate.passes),
+        "why": why(candidate, None),
+    }
+
+
+def _step_of(found: Search, model: Adopted) -> Step | None:
+    """The round in which a model was adopted; its form, what it began with and its settings on a range were moved
+    since: of several rounds the one with the nearest."""
+    grids = profiled(model.component)
+    ranges = [name for name, grid in grids.items() if isinstance(grid, (Range, Frequencies))]
+    free = {*ranges, *(name for name, grid in grids.items() if isinstance(grid, (Forms, Beginning)))}
+
+    def apart(adopted: Adopted) -> float:
+        pairs = [(float(adopted.settings.get(name, 0.0)), float(model.settings.get(name, 0.0))) for name in ranges]
+        return sum(abs(a - b) / (abs(a) + abs(b)) for a, b in pairs if a != b)
+
+    fitting = [
+        (apart(step.adopted.model), number)
+        for number, step in enumerate(found.steps)
+        if step.adopted is not None
+        and step.adopted.model.name == model.name
+        and all(step.adopted.model.settings.get(k) == v for k, v in model.settings.items() if k not in free)
+    ]
+    return found.steps[min(fitting)[1]] if fitting else None
+
+
+def _adopted(found: Search, index: int) -> dict[str, Any]:
+    state = found.last
+    model = state.adopted[index]
+    edges = np.cumsum([0, *(len(t) for t in state.theta)])
+    part = slice(int(edges[index]), int(edges[index + 1]))
+    assert state.terms is not None and state.estimate is not None
+    std = np.sqrt(np.maximum(np.diag(state.estimate.covariance), 0.0))[part]
+    names, sensors = state.terms.names[part], state.terms.sensors[part]
+    units = state.terms.units[part]
+    step = _step_of(found, model)
+    before, after = removal(found.told, index)
+    if step is not None and step.adopted is not None and model.name == NAME:  # its waveform has seen the data
+        before, after = (rms * step.before.residual.scale for rms in step.adopted.assessment.gain.rms)
+    rivals = [] if step is None else list(step.rivals)
+    p = float("nan") if step is None or step.adopted is None else step.adopted.assessment.p
+    return {
+        "error_model": model.name,
+        "kind": model.component.effect,
+        "sensors": [s for s in state.excitation.sensors if s in set(sensors)],
+        "settings": _settings(model),
+        "coefficients": [
+            {"name": n, "sensor": s, "value": float(v), "std": float(d), "units": u}
+            for n, s, v, d, u in zip(names, sensors, state.theta[index], std, units, strict=True)
+        ],
+        "evidence": {"held_out_rms_before_nT": before, "held_out_rms_after_nT": after, "z": z_of(p)},
+        "indistinguishable_from": rivals,
+        **({"channels_as_good": list(step.channels)} if step is not None and step.channels else {}),
+    }
+
+
+def _settings(model: Adopted) -> dict[str, Any]:
+    """The settings of a model, times in their order."""
+    found = {k: _plain(v) for k, v in model.settings.items()}
+    times = [name for name, grid in profiled(model.component).items() if isinstance(grid, EventTimes)]
+    return found | dict(zip(times, sorted(found[name] for name in times), strict=True))
+
+
+def _plain(value: Any) -> Any:
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def z_of(p: float) -> float | None:
+    """The normal deviate with that two-sided probability."""
+    from scipy.special import ndtri
+
+    return float(-ndtri(max(p, 1e-300) / 2.0)) if np.isfinite(p) else None
+
+
+def _rejected(found: Search) -> list[dict[str, Any]]:
+    """Every model that was tried and not adopted, as it stood in the last round that looked at it closely."""
+    adopted = {a.name for a in found.last.adopted}
+    last: dict[str, str] = {}
+    looked_at = {c.model.name for step in found.steps for c in step.candidates}
+    for number, step in enumerate(found.steps, 1):
+        for candidate in step.candidates:
+            if step.adopted is None or candidate is not step.adopted:
+                last[candidate.model.name] = f"round {number}: {why(candidate, step.adopted)}"
+        for name, reason in step.refused.items():
+            last[name] = f"round {number}: {reason}"
+        for name in set(step.dropped) - set(step.refused):
+            last[name] = f"round {number}: dropped, no longer significant beside the others"
+    for name in {name for step in found.steps for name in step.screened}:
+        last.setdefault(name, "screened with every setting: it explains too little to be looked at closely")
+    if found.shared is not None and found.shared.significant:
+        last[NAME] = found.shared.objection or "not among the models that may be adopted"
+    last |= {name: f"could not be tried: {reason}" for name, reason in found.failed.items() if name not in looked_at}
+    return [{"error_model": n, "why": w} for n, w in sorted(last.items()) if n not in adopted]
+
+
+def why(candidate: Candidate, winner: Candidate | None) -> str:
+    """Why a candidate was not adopted in its round."""
+    gain = candidate.assessment.gain
+    p = f"p {candidate.adjusted_p:.2g} after correction"
+    if candidate.significant and candidate.adjusted_p >= candidate.alpha:
+        p += f" by blocks, {candidate.adjusted_own_p:.2g} in noise of each sensor's own spectrum"
+    if happens_once(candidate.model):
+        p += " in noise of each sensor's own spectrum"
+    figures = f"{p}, held-out gain {gain.total:.4g} (t {gain.t:.2g})"
+    if not candidate.significant:
+        return f"not significant: {figures}"
+    if candidate.of_the_log and candidate.log_noise > 0:
+        return f"noise in the log of a channel, which another model brought in, explains as much: {figures}"
+    if candidate.of_second_order:
+        return f"less than 0.3 % of what is adopted, whose next order would explain as much: {figures}"
+    if candidate.of_the_law:
+        return f"less than 5 % of an adopted effect of the same driver and sensors, whose law may miss it: {figures}"
+    if not candidate.beyond_slow_noise:
+        return f"slow noise as strong as the residual's own would explain as much: {figures}"
+    if not candidate.passes:
+        return f"does not predict held-out blocks: {figures}"
+    if winner is not None:
+        ahead = winner.assessment.gain.total
+        return f"{winner.model.name} explained more (held-out gain {ahead:.4g}): {figures}"
+    return figures

@@ -1,0 +1,205 @@
+"""What a search adopted, weighed against what it left.
+
+Any law of the attitude resembles any other one a little. Where something large that follows the attitude has no name
+(a gradient of the site, and no attitude logged to know it by), a named law that is a small part of it is significant,
+predicts held-out blocks, and is wrong elsewhere: of the five components of a gradient one looks exactly like a
+quadratic nonlinearity. So an adopted effect that follows the attitude and explains less than what stays unexplained is
+taken out again. So is a tone that may be a harmonic of how the platform turns; and so is what happened once, where more
+of the kind beside it is significant and predicts nothing, as where a sensor wanders, or where the sensors share a
+waveform that has no name and is larger, or switches along the same vectors: a step or a passage may be a part of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from magtensor.calibration.types import Array
+from magtensor.error_models.direction import attitude_series, turning_Hz
+from magtensor.error_models.settings import Frequencies, profiled
+from magtensor.error_models.terms import joined
+from magtensor.error_models.waveform import NAME
+from magtensor.loop.evidence.assessment import estimated
+from magtensor.loop.evidence.residual import taken_off
+from magtensor.loop.fitting.model import Adopted, State
+from magtensor.loop.remainder.predictable import enough_for_the_total_field, predictable_in_the_total_field
+from magtensor.loop.searching.contribution import happens_once, removal, slices
+from magtensor.loop.searching.found import Search
+from magtensor.loop.searching.unexplained import unexplained, unlikely
+
+MOSTLY = 0.5  # of what an effect adds: so much of it, predicted from the attitude, follows the attitude
+ALONG = 0.95  # cosine, with a source's vector or another event's; of one sensor 5 % of all directions are as near
+HARMONICS = 16  # of the turning, that a law of the attitude with a corner shows
+
+
+def overshadowed(found: Search, fixed: int) -> tuple[list[int], str] | None:
+    """The weakest effect that explains less than what stays and may be a part of it, by its places among what is
+    adopted, and why it is doubted."""
+    state, left = found.told, staying(found)
+    weakest: tuple[float, list[int], str] | None = None
+    if (part := _of_an_adopted_source(state, fixed)) is not None:
+        return part
+    for places in _of_one_name(state, fixed):
+        before, after = removal(state, *places)
+        amount = float(np.sqrt(max(before**2 - after**2, 0.0)))
+        if amount >= left or (weakest is not None and amount >= weakest[0]):
+            continue
+        if why := _of_the_attitude(state, places) or _of_what_wanders(found, state, places):
+            weakest = amount, places, why
+    several = _of_one_that_switches(state, fixed)
+    present = (weakest or several) is not None and bool(unexplained(found, found.record)["present"])
+    if weakest is None or not present:
+        return _part_of_a_source(found, fixed) or (several if present else None)
+    amount, places, why = weakest
+    return places, f"it {why} and explains {amount:.3g} nT rms, less than the {left:.3g} nT that stay"
+
+
+def _of_one_name(state: State, fixed: int) -> list[list[int]]:
+    """The places of the adopted models, those of one name together, but each tone by itself."""
+    named: dict[str, list[int]] = {}
+    for place, model in enumerate(state.adopted[fixed:], start=fixed):
+        named.setdefault(f"{model.name} {place}" if _frequency(model) else model.name, []).append(place)
+    return list(named.values())
+
+
+def _frequency(model: Adopted) -> float:
+    """Hz, of a tone; else 0."""
+    marks = profiled(model.component).items()
+    return next((float(model.settings[name]) for name, mark in marks if isinstance(mark, Frequencies)), 0.0)
+
+
+def _of_the_attitude(state: State, places: Sequence[int]) -> str:
+    """In which way adopted models may be a part of a law of the attitude; "" if in none."""
+    frequency = _frequency(state.adopted[places[0]])
+    if frequency and frequency < HARMONICS * (turning := turning_Hz(state.excitation)):
+        return f"may be a harmonic of the platform's turning ({turning:.3g} Hz)"
+    return "follows the attitude" if attitude_share(state, places) > MOSTLY else ""
+
+
+def _of_what_wanders(found: Search, state: State, places: Sequence[int]) -> str:
+    """Whether something that happened once may be a stretch of what wanders: more of the kind is significant beside it
+    and predicts nothing."""
+    last = found.steps[-1].candidates if found.steps else ()
+    if not happens_once(state.adopted[places[0]]):
+        return ""
+    more = [c.model.name for c in last if happens_once(c.model) and unlikely(c) and not c.passes]
+    return f"is no lone event ({' and '.join(more)} beside it would predict nothing)" if more else ""
+
+
+def _of_an_adopted_source(state: State, fixed: int) -> tuple[list[int], str] | None:
+    """An offset that came or went and lies along the vectors of an adopted source that nobody logged."""
+    source = next((v for v in (_vector(state, i) for i, a in enumerate(state.adopted) if a.name == NAME)), None)
+    if source is None:
+        return None
+    for place, model in enumerate(state.adopted):
+        own = _vector(state, place) if place >= fixed and happens_once(model) else None
+        if own is not None and _along(own, source):
+            return [place], f"it lies along the vectors of {NAME}, of which it is a part"
+    return None
+
+
+def _of_one_that_switches(state: State, fixed: int) -> tuple[list[int], str] | None:
+    """Several offsets that came or went along one vector: something switches, and more often than they tell."""
+    events = [(i, _vector(state, i)) for i, a in enumerate(state.adopted) if i >= fixed and happens_once(a)]
+    known = [(i, v) for i, v in events if v is not None]
+    for _, first in known:
+        places = [i for i, v in known if _along(v, first) or _along(first, v)]
+        if len(places) > 1:
+            sensors = [s for s, v in zip(state.excitation.sensors, first.reshape(-1, 3), strict=True) if v.any()]
+            return (
+                places,
+                f"something in {', '.join(sensors)} switches along one vector, more often than such events tell",
+            )
+    return None
+
+
+def _vector(state: State, place: int) -> Array | None:
+    """(3 S,) nT for a unit of the one series of an adopted model, by which it moves each output; None where it has
+    several series."""
+    terms = state.adopted[place].terms(state.excitation)
+    if terms.series.shape[1] != 1 or terms.delay is not None:
+        return None
+    vector = np.zeros(3 * len(state.excitation.sensors))
+    raw = terms.part_output >= 0
+    np.add.at(vector, terms.part_output[raw], terms.part_weight[raw] * state.theta[place][terms.part_term[raw]])
+    return vector if vector.any() else None
+
+
+def _along(one: Array, other: Array) -> bool:
+    """Whether a vector lies along another one, in the outputs that it moves."""
+    seen = np.where(one != 0.0, other, 0.0)
+    return abs(float(one @ seen)) > ALONG * float(np.linalg.norm(one) * np.linalg.norm(seen))
+
+
+def _part_of_a_source(found: Search, fixed: int) -> tuple[list[int], str] | None:
+    """An effect that happened once beside a waveform of no name that is larger, or of which it may be one switching
+    among several, and why it is doubted."""
+    shared, state = found.shared, found.last
+    if shared is None or NAME in {a.name for a in state.adopted}:
+        return None
+    if not shared.significant or not shared.gain.consistent:
+        return None
+    amount = float(np.sqrt(np.mean(shared.direction**2)))
+    for place, model in enumerate(state.adopted):
+        if place < fixed or not happens_once(model):
+            continue
+        assert state.terms is not None
+        theta = np.zeros(state.terms.count)
+        theta[slices(state)[place]] = state.theta[place]
+        own = float(np.sqrt(np.mean(state.terms.contribution(theta, shared.direction.size) ** 2)))
+        if own < amount or (shared.switches and shared.left_by == model.name):
+            shared_by = f"the waveform that the sensors share ({amount:.3g} nT)"
+            places = [i for i, a in enumerate(state.adopted) if a.name == model.name and i >= fixed]
+            return places, f"it explains {own:.3g} nT rms and may be a part of {shared_by}"
+    return None
+
+
+def staying(found: Search) -> float:
+    """nT rms above the white noise that stays and may follow the attitude: without what the best of the significant
+    effects of something else would explain that a gate refused, as one that happened once and predicts nothing, or
+    without what of |b| - F does not follow it, as where the base station is noisy."""
+    state, residual = found.told, found.told.residual
+    other = _of_the_reference(state)
+    for candidate in found.steps[-1].candidates if found.steps else ():
+        if max(candidate.adjusted_p, candidate.adjusted_null_p) >= candidate.alpha:
+            continue
+        terms = candidate.model.terms(state.excitation).at(residual.samples)
+        together = terms if state.terms is None else joined([state.terms, terms])
+        theta = estimated(residual, together, state.colours).theta
+        explained = residual.square() - taken_off(residual, together, theta).square()
+        own = terms.contribution(theta[together.count - terms.count :], len(residual.noise))
+        if explained > other and attitude_part(state, own) <= MOSTLY:
+            other = explained
+    return float(np.sqrt(max(residual.square() - 1.0 - other, 0.0)) * residual.scale)
+
+
+def _of_the_reference(state: State) -> float:
+    """Mean square, of the whole whitened residual, that |b| - F adds to its white noise and that the attitude does not
+    predict; 0 where there are too few samples to ask."""
+    residual = state.residual
+    if residual.across is None or residual.along is None or not enough_for_the_total_field(state):
+        return 0.0
+    beyond = float(np.mean(residual.along**2) - 1.0) / residual.freedom
+    return max(beyond - predictable_in_the_total_field(state) ** 2, 0.0)
+
+
+def attitude_share(state: State, places: Sequence[int]) -> float:
+    """How much of the variance of what adopted models add can be predicted from the attitude, whatever the law."""
+    assert state.terms is not None
+    theta = np.zeros(state.terms.count)
+    for place in places:
+        part = slices(state)[place]
+        theta[part] = state.theta[place]
+    return attitude_part(state, state.terms.contribution(theta, len(state.residual.noise)))
+
+
+def attitude_part(state: State, added: Array) -> float:
+    """The same of series (N, 3 S) nT that are added to the outputs at the residual's samples."""
+    residual = state.residual
+    series = attitude_series(state.excitation)[residual.samples]
+    own = residual.free_across
+    added, series = (x - own @ (own.T @ x) for x in (added / residual.noise, series))
+    follows = np.linalg.lstsq(series, added, rcond=None)[0]
+    total = float(np.sum(added**2))
+    return 1.0 - float(np.sum((added - series @ follows) ** 2)) / total if total > 0 else 0.0

@@ -1,0 +1,161 @@
+"""Which of the models that a survey does not tell apart is adopted, and which are named as its rivals."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from magtensor.error_models.excitation import Excitation
+from magtensor.error_models.settings import AnyChannel, profiled
+from magtensor.error_models.terms import joined
+from magtensor.loop.evidence.assessment import estimated, explained
+from magtensor.loop.fitting.model import State, generic
+from magtensor.loop.fitting.separation import SEPARATION, fold_gain, separated
+from magtensor.loop.searching.beginnings import beginning
+from magtensor.loop.searching.contribution import happens_once
+from magtensor.loop.searching.gates import OF_THE_LAW, SECOND_ORDER, Candidate
+from magtensor.loop.searching.several_logs import worse_log
+
+SMALL_PART = 0.5  # less than half is no rival: something else is the cause of most of it
+SLOW = 0.5  # of the survey: a longer lag is no better known than a drift
+
+
+def simplest(best: Candidate, possible: Sequence[Candidate], state: State) -> tuple[Candidate, tuple[str, ...]]:
+    """The simplest of the models that the held-out blocks do not separate from the best, and the others' names.
+
+    Nor are two told apart by less than the next order of what both explain, a channel that nobody wrote a model for
+    from the model that names its effect by less than that one's law may miss, and two logs of one cause by the noise of
+    the worse one. What a response began with was fitted to all blocks, of which none was held out for it: from a model
+    that needs none it is told apart by the likelihood of all of them.
+
+    Simplest is more of what was adopted already, with another setting; then what has the fewest coefficients, what it
+    began with among them, and of those what lasts; a response that lags by half the survey or longer comes after both.
+    A model that slow noise could explain is named, and not chosen before one that it could not.
+    """
+    colours = best.assessment.colours
+    reference = fold_gain(best.before or state, colours, best.terms)
+    equal: list[Candidate] = [best]
+    for other in possible:
+        if other is best:
+            continue
+        spare = max(other.assessment.estimate.rank - best.assessment.estimate.rank, 0)
+        found = fold_gain(other.before or state, colours, other.terms)
+        named = generic(best.model) and not generic(other.model) and _channel(best) == _channel(other)
+        behind = reference.over(found).total
+        alike = behind <= (OF_THE_LAW if named else SECOND_ORDER) * reference.total
+        alike = alike or (begun(best) > begun(other) and _as_likely(best, other, state))
+        if alike or not separated(reference, found, spare) or worse_log(best, other, behind, state):
+            equal.append(other)
+    known = {a.name for a in state.adopted}
+
+    def complexity(c: Candidate) -> tuple[bool, bool, bool, int, bool, float]:
+        slow, new, once = hardly_begun(c, state.excitation), c.model.name not in known, happens_once(c.model)
+        return generic(c.model), slow, new, c.assessment.estimate.rank + begun(c), once, -c.assessment.gain.total
+
+    chosen = min((c for c in equal if c is best or c.passes), key=complexity)
+    chosen = lasting_instead(chosen, possible)
+    return chosen, tuple(sorted({c.model.name for c in equal if c is not chosen} - {chosen.model.name}))
+
+
+def containing(best: Candidate, possible: Sequence[Candidate], state: State) -> Candidate:
+    """The best of the models that predict more and leave `best` nothing to predict; `best` where there is none.
+
+    Slow noise could explain such a model, but not `best`, which is a part of what it explains: a drift, say, that is
+    more than a warming up.
+    """
+    more = [c for c in possible if c.assessment.gain.total > best.assessment.gain.total + SEPARATION]
+    for other in sorted(more, key=lambda c: -c.assessment.gain.total):
+        colours = other.assessment.colours
+        before = other.before or state
+        alone = fold_gain(before, colours, other.terms)
+        if fold_gain(before, colours, other.terms, best.terms).total - alone.total < SEPARATION:
+            return other
+    return best
+
+
+def part_of(candidate: Candidate, other: Candidate, state: State) -> bool:
+    """Whether a candidate predicts a small part of what another one does, and next to nothing beside it."""
+    whole, own, both = _beside(candidate, other, state)
+    return own < SMALL_PART * whole and both - whole < SMALL_PART * own
+
+
+def overlaps(candidate: Candidate, other: Candidate, state: State) -> bool:
+    """Whether most of what a candidate predicts another one does."""
+    whole, own, both = _beside(candidate, other, state)
+    return both - whole < SMALL_PART * own
+
+
+def part_of_a_drift(candidate: Candidate, candidates: Sequence[Candidate], state: State) -> str:
+    """The name of a model of what lasts that predicts as much as a candidate of what happened once, and leaves it
+    next to nothing; "" where there is none.
+
+    A drift is judged by the scatter of long blocks, which tells little of it, and something that happened once is not.
+    Where a drift predicts more on blocks that neither has seen, the event is the place where it is steepest.
+    """
+    if not happens_once(candidate.model):
+        return ""
+    least = candidate.assessment.gain.total
+    for other in candidates:
+        gain = other.assessment.gain
+        if happens_once(other.model) or generic(other.model) or gain.total < least or not gain.consistent:
+            continue
+        whole, own, both = _beside(candidate, other, state)
+        if own <= whole and both - whole < SMALL_PART * own:
+            return other.model.name
+    return ""
+
+
+def _beside(candidate: Candidate, other: Candidate, state: State) -> tuple[float, float, float]:
+    """What another model, a candidate and both together predict, in noise of the colour that the other leaves."""
+    each = ([other.terms], [candidate.terms], [other.terms, candidate.terms])
+    whole, own, both = (fold_gain(state, other.assessment.colours, *terms).total for terms in each)
+    return whole, own, both
+
+
+def begun(candidate: Candidate) -> int:
+    """With how many values a response began out of equilibrium."""
+    found = beginning(candidate.model.component, candidate.model.settings)
+    return sum(bool(candidate.model.settings[name]) for name in found[0]) if found else 0
+
+
+def _as_likely(best: Candidate, other: Candidate, state: State) -> bool:
+    """Whether another model explains as much as the best one, on all blocks together."""
+
+    def whole(c: Candidate) -> float:
+        before = c.before or state
+        together = c.terms if before.terms is None else joined([before.terms, c.terms])
+        return explained(estimated(before.residual, together, best.assessment.colours))
+
+    return whole(best) - whole(other) < SEPARATION
+
+
+def lasting_instead(chosen: Candidate, possible: Sequence[Candidate]) -> Candidate:
+    """What lasts in the place of something that happens once, if it predicts more with no more coefficients.
+
+    A slip soon after the start is a delay for all but the first samples: the few blocks that it misses scatter what it
+    is behind by, so that it seems no worse than the best, from which the delay itself is told apart.
+    """
+    if not happens_once(chosen.model):
+        return chosen
+    better = [
+        c
+        for c in possible
+        if c.passes
+        and not happens_once(c.model)
+        and not generic(c.model)
+        and c.assessment.estimate.rank <= chosen.assessment.estimate.rank
+        and c.assessment.gain.total > chosen.assessment.gain.total
+    ]
+    return max(better, key=lambda c: c.assessment.gain.total, default=chosen)
+
+
+def hardly_begun(candidate: Candidate, x: Excitation) -> bool:
+    """Whether a response lags by half the survey or more: what it followed was over before it began, and a channel seen
+    through such a lag can be any drift."""
+    found = beginning(candidate.model.component, candidate.model.settings)
+    return found is not None and float(candidate.model.settings[found[1].lag]) > SLOW * x.duration
+
+
+def _channel(candidate: Candidate) -> str:
+    """The channel that a model follows; "" where it follows none."""
+    settings, marks = candidate.model.settings, profiled(candidate.model.component).items()
+    return next((str(settings[name]) for name, mark in marks if isinstance(mark, AnyChannel)), "")

@@ -1,0 +1,322 @@
+"""The rounds of a search: the best candidate that passes is adopted, everything is refitted, and so on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+from magtensor.components import Component
+from magtensor.error_models.excitation import Excitation
+from magtensor.error_models.needs import missing
+from magtensor.errors import DataError
+from magtensor.loop.evidence.spectrum import spectral_lines
+from magtensor.loop.fitting.log_noise import channels_of
+from magtensor.loop.fitting.model import Fitting, Record, State, generic
+from magtensor.loop.fitting.trial import Trial, on_the_folds_of, per_sample, trial
+from magtensor.loop.remainder.changing_matrix import channel_instead
+from magtensor.loop.searching.adopting import adopt, narrowed, polished
+from magtensor.loop.searching.contribution import (
+    agrees,
+    eliminate,
+    happens_once,
+    of_all_alike,
+    share_of_the_field,
+    without_models,
+)
+from magtensor.loop.searching.course_of_time import beside_time, rivals_in_time
+from magtensor.loop.searching.exchange import looked_at_again, simpler
+from magtensor.loop.searching.found import Step
+from magtensor.loop.searching.gates import Candidate
+from magtensor.loop.searching.latent import NAME, Sought, Source, renewed, sought, tried_source
+from magtensor.loop.searching.own_fit import at_their_own_fit
+from magtensor.loop.searching.profiling import already, repeatable
+from magtensor.loop.searching.rivals import containing, hardly_begun, overlaps, part_of, part_of_a_drift, simplest
+from magtensor.loop.searching.screening import candidates_of
+from magtensor.loop.searching.split import split
+from magtensor.loop.searching.which_channel import nearest
+
+MOST_OF_A_SAMPLE = 50.0  # log likelihood: half of the largest squared residual of a sample that noise may explain
+ONE_OF_A_KIND = "fitted, its settings are those of what is adopted already"  # its law is no single one
+ROUNDING = 1e-4  # mean square of the whitened residual: far below the least noise that any sensor is believed to have
+
+
+@dataclass(frozen=True)
+class Ended:
+    """Where rounds of a search ended: nothing more is adopted.
+
+    Attributes:
+        record: as in `Search`; state: the fit with all that was adopted; how: it was made.
+        steps: in order; shared: the waveform that the sensors share.
+    """
+
+    record: Record
+    state: State
+    how: Fitting
+    steps: tuple[Step, ...]
+    shared: Sought | None
+
+    @property
+    def adopts(self) -> bool:
+        """Whether anything was adopted."""
+        return any(step.adopted is not None for step in self.steps)
+
+
+@dataclass
+class Rounds:
+    """The rounds of a search, in each of which an effect is adopted.
+
+    Attributes:
+        models, most_effects, alpha, lines, say: as in `search`; fixed: how many models were declared.
+        failed: model -> why its regressors could not be made.
+    """
+
+    models: Sequence[Component]
+    fixed: int
+    most_effects: int
+    alpha: float
+    lines: Sequence[float] | None
+    say: Callable[[str], None] | None
+    failed: dict[str, str] = field(default_factory=dict)
+
+    def candidates(self, state: State, record: Record, how: Fitting) -> list[Candidate]:
+        """What may be adopted beside what is."""
+        models = self.open_models(state)
+        found = at_their_own_fit(candidates_of(state, models, self.failed, self.alpha), record, state, how)
+        for two in split(state, self.fixed, self.alpha, len(models)):
+            same = next((c for c in found if c.model.name == two.model.name), None)
+            if two.passes and (
+                same is None or not same.passes or same.assessment.gain.total < two.assessment.gain.total
+            ):
+                found = [c for c in found if c is not same] + [two]
+        return sorted(found, key=lambda c: -c.assessment.gain.total)
+
+    def open_models(self, state: State) -> list[Component]:
+        """The models that have what they need and are not in already, or can be in more than once."""
+        taken = {a.name for a in state.adopted}
+        return [m for m in testable(state.excitation, self.models) if m.name not in taken or repeatable(m)]
+
+    def run(self, record: Record, state: State, how: Fitting) -> Ended:
+        """Adopt the best, refit, repeat, until nothing is left that the data want."""
+        shared: Sought | None = None
+        standing = trial(record, state, how)
+        steps: list[Step] = []
+        asked = False  # whether something simpler does as well
+        for _ in range(self.most_effects + 2):
+            state = with_lines(state, record, self.lines)
+            if len(state.adopted) - self.fixed >= self.most_effects or state.residual.square() < ROUNDING:
+                break
+            candidates = self.candidates(state, record, how)
+            open_ = len(testable(state.excitation, self.models))
+            adopted = _first_kept(record, standing, candidates, how, self.fixed, open_, self.say)
+            step = adopted.step(state, candidates)
+            steps.append(replace(step, screened=tuple(m.name for m in self.open_models(state))))
+            if adopted.standing is not None:
+                record, state = renewed(record, adopted.standing.state, how)
+                standing = replace(adopted.standing, state=state)
+                continue
+            exchanged = None if asked else _exchanged(record, state, steps, how, self.fixed, open_)
+            asked = True
+            if exchanged is not None:
+                after, step = exchanged
+                if self.say is not None and step.adopted is not None:
+                    self.say(f"{step.adopted.model.name} takes the place of {', '.join(step.refused)}")
+                steps[-1] = step
+                record, state = renewed(record, after.state, how)
+                standing = replace(after, state=state)
+                continue
+            shared, found = self.with_source(record, state, how, steps[-1])
+            if found is None:
+                break
+            record, state, steps[-1] = found
+            shared, standing = None, trial(record, state, how)
+        return Ended(record, state, how, tuple(steps), shared)
+
+    def with_source(
+        self, record: Record, state: State, how: Fitting, step: Step
+    ) -> tuple[Sought | None, tuple[Record, State, Step] | None]:
+        """The waveform that the sensors share, and the fit with a source nobody logged that makes it; None where none
+        is adopted."""
+        hidden = next((m for m in self.models if m.name == NAME), None)
+        shared = sought(state, record)
+        if shared is None or hidden is None or NAME in {a.name for a in state.adopted}:
+            return shared, None
+        shared, source = tried_source(hidden, record, state, shared, how, self.alpha)
+        instead = None
+        if source is None and shared.left_by:
+            instead = shared.left_by
+            source = _source_instead(hidden, record, state, shared, how, self.fixed, self.alpha)
+        if source is None:
+            return shared, None
+        if self.say is not None:
+            self.say(f"adopting {NAME}")
+        record, state = source.record, source.after
+        last, dropped = eliminate(record, state, how, self.fixed)
+        if dropped and NAME not in dropped:  # what had taken a part of the source for its own
+            record, state = renewed(record, last, how)
+        gone = (*([instead] if instead else []), *(() if NAME in dropped else dropped))
+        return None, (record, state, replace(step, adopted=source.evidence, dropped=gone))
+
+
+def _exchanged(
+    record: Record, state: State, steps: Sequence[Step], how: Fitting, fixed: int, models: int
+) -> tuple[Trial, Step] | None:
+    """The fit with a simpler model in the place of an adopted one that it does as well as, and the round's story."""
+    found = simpler(state, steps, fixed)
+    if found is None:
+        return None
+    place, other = found
+    old = state.adopted[place].name
+    without = without_models(record, state, [place], how)
+    chosen = looked_at_again(without, other, models)
+    if chosen is None:
+        return None
+    after, _ = _kept(record, trial(record, without, how), chosen, how)
+    if after is None:
+        return None
+    why = f"{chosen.model.name}, which has fewer coefficients, does as well beside the others"
+    return after, Step(without, (chosen,), chosen, (old,), refused={old: why})
+
+
+def _source_instead(
+    component: Component, record: Record, state: State, left: Sought, how: Fitting, fixed: int, alpha: float
+) -> Source | None:
+    """A source nobody logged in the place of the adopted effect that has the same vectors at the sensors: of something
+    that switches now and then a single step is a part, and so is what channels show that feel it late. None where it
+    does not do better.
+
+    Parameters
+    ----------
+    left: what the effect leaves.
+    """
+    places = [i for i, a in enumerate(state.adopted) if a.name == left.left_by and i >= fixed]
+    if not places:
+        return None
+    less = without_models(record, state, places, how)
+    tried = left.significant and all(generic(state.adopted[i]) for i in places)
+    shared = sought(less, record, may_follow=tried)
+    source = None if shared is None else tried_source(component, record, less, shared, how, alpha)[1]
+    if source is None:
+        return None
+    lost = max(int(state.fit.keep.sum() - source.after.fit.keep.sum()), 0) / len(state.residual.affine)
+    return source if per_sample(source.after) > per_sample(state) + MOST_OF_A_SAMPLE * lost else None
+
+
+@dataclass(frozen=True)
+class _Kept:
+    """The outcome of a round; `standing` is None where nothing was kept."""
+
+    standing: Trial | None
+    chosen: Candidate | None = None
+    rivals: tuple[str, ...] = ()
+    channels: tuple[str, ...] = ()
+    dropped: tuple[str, ...] = ()
+    refused: Mapping[str, str] = field(default_factory=dict)
+
+    def step(self, before: State, candidates: Sequence[Candidate]) -> Step:
+        """The round's story; what follows another channel than its candidate did stands in its place."""
+        kept = self.chosen
+        told = tuple(kept if kept and c.model.name == kept.model.name else c for c in candidates)
+        return Step(before, told, kept, self.rivals, self.dropped, self.refused, channels=self.channels)
+
+
+def _first_kept(
+    record: Record,
+    before: Trial,
+    candidates: Sequence[Candidate],
+    how: Fitting,
+    fixed: int,
+    models: int,
+    say: Callable[[str], None] | None,
+) -> _Kept:
+    """Fit the candidates that pass, found among so many models, the best first, until one is kept."""
+    refused: dict[str, str] = {}
+    while passing := [c for c in candidates if c.passes and c.model.name not in refused]:
+        best = max(passing, key=lambda c: c.assessment.gain.total)
+        possible = [c for c in candidates if c.predicts and c.model.name not in refused]
+        best = containing(best, possible, before.state)
+        chosen, rivals = simplest(best, possible, before.state)
+        if name := part_of_a_drift(chosen, candidates, before.state):
+            refused[chosen.model.name] = f"{name}, which lasts, predicts as much"
+            continue
+        chosen, channels = nearest(chosen, before.state, models)
+        time = beside_time(chosen, before.state)
+        if time.refused:
+            refused[chosen.model.name] = time.refused
+            continue
+        if not time.seen:
+            rivals = tuple(sorted({*rivals, *rivals_in_time(chosen, possible, before.state)}))
+        if say is not None:
+            say(f"adopting {chosen.model.name}")
+        after, why = _kept(record, before, chosen, how)
+        if after is None:
+            refused[chosen.model.name] = why
+            for c in candidates:
+                if not c.passes or c.model.name in refused:
+                    continue
+                if part_of(c, chosen, before.state):
+                    refused[c.model.name] = f"a small part of what {chosen.model.name} explains, which failed"
+                elif why == ONE_OF_A_KIND and overlaps(c, chosen, before.state):
+                    refused[c.model.name] = f"most of it is what the law of {chosen.model.name} leaves"
+            continue
+        last, dropped = eliminate(record, after.state, how, fixed)
+        if dropped:
+            after = trial(record, last, how)
+        if chosen.model.name in dropped and len(last.adopted) <= len(before.state.adopted):
+            refused[chosen.model.name] = "fitted, it does not earn its place on held-out blocks"
+            continue
+        return _Kept(after, chosen, rivals, channels, dropped, refused)
+    return _Kept(None, refused=refused)
+
+
+def _kept(record: Record, before: Trial, chosen: Candidate, how: Fitting) -> tuple[Trial | None, str]:
+    """The fit with a model, on fewer sensors where it hurts one that it does not help; None, and why, if it fails."""
+    try:
+        after = trial(record, polished(record, adopt(record, before.state, chosen, how), how), how)
+    except DataError as error:  # with coefficients that run away nothing is left to calibrate
+        return None, f"it cannot be fitted: {error.what.split(':')[0]}"
+    before = on_the_folds_of(after, record, before, how)
+    hurt, which = before.hurt_by(after), len(before.state.adopted)
+    if hurt:
+        own = after.state.adopted[which].sensors or tuple(record.sensors)
+        helped = [s for s in before.helped_by(after) if s in own]
+        if helped and set(chosen.terms.sensors) >= set(own):
+            after = trial(record, narrowed(record, after.state, which, tuple(helped), how), how)
+            before = on_the_folds_of(after, record, before, how)
+            hurt = before.hurt_by(after)
+    if hurt:
+        return None, f"fitted, it raises the held-out error of {', '.join(hurt)}"
+    model = after.state.adopted[which]
+    acts_on = model.sensors or tuple(record.sensors)
+    same = [a for a in after.state.adopted[:which] if set(a.sensors or record.sensors) & set(acts_on)]
+    two_channels = chosen.moved is None and channels_of(model, after.state.excitation)
+    if not two_channels and already(same, model.component, model.settings):
+        return None, ONE_OF_A_KIND
+    slow, channels = hardly_begun(chosen, after.state.excitation), sorted(channels_of(model, after.state.excitation))
+    if (slow or channels) and of_all_alike(after.state, which):
+        drift = "drifts" if slow else f"follows {' and '.join(channels)}"
+        return None, f"fitted, all sensors show it alike: an error of the base station that {drift} would look the same"
+    if not agrees(after.state, which):
+        return None, "fitted, its coefficients are not what its settings assume"
+    if how.nominal is not None and (share := share_of_the_field(after.state, which)) > how.nominal.scale:
+        # what C takes back of it keeps it from being seen
+        return None, f"fitted, it makes {share:.0%} of the field: more than is assumed of a sensor"
+    if not before.likelier(after):
+        return None, "fitted together with the others, it leaves more than it takes away"
+    if happens_once(model):
+        terms = chosen.terms.only(i for i, s in enumerate(chosen.terms.sensors) if s in acts_on)
+        if channel := channel_instead(before.state, terms, chosen.assessment.colours):
+            why = f"C of {', '.join(acts_on)} follows {channel}, which explains more than something that happens once"
+            return None, why
+    return after, ""
+
+
+def testable(x: Excitation, models: Sequence[Component]) -> list[Component]:
+    """The models that have what they need, beside what is adopted."""
+    return [m for m in models if not missing(m, x)]
+
+
+def with_lines(state: State, record: Record, lines: Sequence[float] | None = None) -> State:
+    """The state, its excitation knowing the strongest lines in the spectrum of what is left, or those given."""
+    if lines is None:
+        lines = [f for f, _, _ in spectral_lines(state.residual, record.time[state.residual.samples])]
+    return replace(state, excitation=replace(state.excitation, lines=tuple(lines)))

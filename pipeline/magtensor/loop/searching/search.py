@@ -1,0 +1,182 @@
+"""The search: screen every error model, adopt what the data want on blocks the fit has not seen, refit, repeat.
+
+An effect is adopted only when it passes two independent gates: significance that autocorrelation cannot fake, with the
+family-wise error held by Holm's rule over every model and every setting tried, and a gain on held-out contiguous folds.
+Rivals that do as well on this survey are named, and the simplest of them is adopted. In the end what was adopted is
+weighed against what stays unexplained.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+from magtensor.components import Component
+from magtensor.error_models.excitation import Excitation
+from magtensor.error_models.needs import missing
+from magtensor.errors import DataError
+from magtensor.loop.fitting.model import Adopted, Fitting, Record, State, of_the_site
+from magtensor.loop.fitting.refit import joint_state
+from magtensor.loop.fitting.trial import on_the_folds_of, trial
+from magtensor.loop.fitting.wandering import all_noise, narrowed_to, of_sensors, quieter, unweighed
+from magtensor.loop.searching.adopting import on_those_that_show
+from magtensor.loop.searching.contribution import eliminate, without_models
+from magtensor.loop.searching.found import Search, Step
+from magtensor.loop.searching.gates import ALPHA
+from magtensor.loop.searching.latent import NAME, SINGLE_STRETCH, renewed, sought
+from magtensor.loop.searching.overshadowed import overshadowed
+from magtensor.loop.searching.rounds import Ended, Rounds, with_lines
+
+MOST_EFFECTS = 8
+
+
+def search(
+    record: Record,
+    models: Sequence[Component],
+    how: Fitting,
+    *,
+    declared: Sequence[Adopted] = (),
+    most_effects: int = MOST_EFFECTS,
+    alpha: float = ALPHA,
+    lines: Sequence[float] | None = None,
+    say: Callable[[str], None] | None = None,
+) -> Search:
+    """Find the effects that the declared model lacks.
+
+    Parameters
+    ----------
+    record: the samples.
+    models: the error models that may be adopted.
+    how: how the joint fit is made.
+    declared: error models that are in the fit from the beginning, never dropped.
+    most_effects: stop after so many adoptions.
+    alpha: family-wise false-alarm probability of the first gate.
+    lines: Hz, the strongest in the spectrum of the survey that the record is a part of; sought in the record if None.
+    say: called with a line about each round.
+    """
+    if declared:
+        sources = [d for d in declared if of_the_site(d.component)]
+        _require_channels(joint_state(record, [], how).excitation, sources or declared)
+        if sources:  # a gradient is known with them
+            _require_channels(joint_state(record, sources, how).excitation, declared)
+    first = joint_state(record, declared, how)
+    rounds = Rounds(models, len(declared), most_effects, alpha, lines, say)
+    ended = rounds.run(record, first, how)
+    if how.nominal is None and len(ended.state.adopted) - len(declared) < most_effects:
+        ended = _without_those_that_wander(ended, rounds)
+    record, state, how, steps = ended.record, ended.state, ended.how, ended.steps
+    last = _settled(record, on_those_that_show(record, state, how, len(declared)), how)
+    if last.fit.keep.sum() < state.fit.keep.sum():  # what only these samples asked for goes with them
+        last, steps = _weighed_once_more(record, last, steps, how, len(declared))
+    shared = ended.shared
+    if shared is None or shared.objection == SINGLE_STRETCH:  # it may be flagged now
+        shared = sought(last, record)
+    evenly = unweighed(record, last, how)
+    not_tested = _not_tested(last.excitation, models)
+    found = Search(first, last, steps, not_tested, rounds.failed, record, shared, how, evenly)
+    while doubted := overshadowed(found, len(declared)):
+        places, why = doubted
+        name = found.last.adopted[places[0]].name
+        if say is not None:
+            say(f"taking {name} out again")
+        record, state = renewed(record, without_models(record, found.last, places, how), how)
+        state, steps = _weighed_once_more(record, state, steps, how, len(declared))
+        candidates = rounds.candidates(state := with_lines(state, record, lines), record, how)
+        step = Step(state, tuple(candidates), None, refused={name: why})
+        source = None if name == NAME else rounds.with_source(record, state, how, step)[1]
+        if source is not None:  # which the model that is gone was a part of
+            record, state, step = source
+        steps, last = (*steps, step), _settled(record, state, how)
+        not_tested = _not_tested(last.excitation, models)
+        found = replace(
+            found, last=last, steps=steps, not_tested=not_tested, record=record, shared=sought(last, record),
+            evenly=unweighed(record, last, how),
+        )  # fmt: skip
+    return found
+
+
+def _without_those_that_wander(ended: Ended, rounds: Rounds) -> Ended:
+    """The search gone on among the quiet sensors alone; what they show is then fitted on all sensors, each weighed by
+    all of its noise, and the search goes on there. Where they show nothing more, C and o are fitted with these weights
+    all the same: they would have a share of what is not theirs."""
+    settled = _settled(ended.record, ended.state, ended.how)  # what is flagged is no wandering
+    wandering = False
+    for names in quieter(settled):
+        wandering = True
+        try:
+            gone_on = _among(names, ended, rounds)
+        except DataError:  # they do not determine a calibration by themselves
+            continue
+        if gone_on is not None:
+            return gone_on
+    if not wandering:
+        return ended
+    how = replace(ended.how, noise=all_noise(settled))
+    again = joint_state(ended.record, ended.state.adopted, how, ended.state.theta, ended.state.lines)
+    return replace(ended, state=again, how=how)
+
+
+def _among(names: tuple[str, ...], ended: Ended, rounds: Rounds) -> Ended | None:
+    """The search gone on with what some of the sensors show by themselves; None where that is nothing, or where it does
+    not help when all are fitted.
+
+    What nothing has explained so far is no longer believed to be an effect.
+    """
+    how, lines = replace(ended.how, searching=False), ended.state.lines
+    some = of_sensors(ended.record, names)
+    models, theta = narrowed_to(ended.state.adopted, ended.state.theta, ended.state, names)
+    among = replace(rounds, fixed=len(models), most_effects=rounds.most_effects - len(models) + rounds.fixed)
+    found = among.run(some, joint_state(some, models, how, theta, lines), how)
+    if not found.adopts:
+        return None
+    new = slice(len(models), None)
+    more, values = narrowed_to(found.state.adopted[new], found.state.theta[new], found.state, names)
+    every, start = [*ended.state.adopted, *more], [*ended.state.theta, *values]
+    record = replace(ended.record, waveform=found.record.waveform)
+    how = replace(ended.how, noise=all_noise(joint_state(record, every, how, start, lines)))
+    before = trial(record, joint_state(record, ended.state.adopted, how, ended.state.theta, lines), how)
+    after = trial(record, joint_state(record, every, how, start, lines), how)
+    if on_the_folds_of(after, record, before, how).hurt_by(after) or not before.likelier(after):
+        return None
+    again = rounds.run(record, after.state, how)
+    steps = tuple(replace(step, among=names) for step in found.steps)
+    return replace(again, steps=(*ended.steps, *steps, *again.steps))
+
+
+def _weighed_once_more(
+    record: Record, state: State, steps: tuple[Step, ...], how: Fitting, fixed: int
+) -> tuple[State, tuple[Step, ...]]:
+    """A fit in which samples or models are missing that were there when the others were adopted, without those that no
+    longer earn their place; and the rounds, which say so."""
+    left, dropped = eliminate(record, state, how, fixed)
+    if not dropped:
+        return state, steps
+    return _settled(record, left, how), (*steps[:-1], replace(steps[-1], dropped=(*steps[-1].dropped, *dropped)))
+
+
+def _settled(record: Record, state: State, how: Fitting) -> State:
+    """The fit at the end: what nothing explains is a disturbance after all, and no part of the calibration."""
+    return joint_state(record, state.adopted, replace(how, searching=False), state.theta, state.lines)
+
+
+def _require_channels(x: Excitation, declared: Sequence[Adopted]) -> None:
+    """A declared error model needs its channels.
+
+    Raises
+    ------
+    DataError: the survey lacks some.
+    """
+    words = [
+        f"{model.name} needs {' and '.join(lacks)}" for model in declared if (lacks := missing(model.component, x))
+    ]
+    if words:
+        raise DataError(
+            f"the declared error models cannot be fitted to this survey: {'; '.join(words)}",
+            hint=f"it logs {', '.join(sorted(x.logged)) or 'no channel'}; leave the model out or log what it follows",
+        )
+
+
+def _not_tested(x: Excitation, models: Sequence[Component]) -> dict[str, tuple[str, ...]]:
+    """What each of the other models lacks; of a source that nobody logged the loop asks in its own way."""
+    lacking = {model.name: tuple(missing(model, x)) for model in models if model.name != NAME}
+    return {name: lacks for name, lacks in lacking.items() if lacks}

@@ -1,0 +1,209 @@
+"""What is left when the search has ended: is it noise, and if not, what does it look like?
+
+Independent sensors have independent noise, white or slow. So what is left is called unexplained only where noise
+cannot make it: a waveform that the sensors share, a line in the spectrum, what follows the direction of the field, a
+sensor whose matrix is not constant, or an error model that is significant and was not adopted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from magtensor.loop.evidence.assessment import assess
+from magtensor.loop.evidence.own_noise import OwnNoise
+from magtensor.loop.evidence.spectrum import spectral_lines
+from magtensor.loop.evidence.stretches import ABOUT
+from magtensor.loop.fitting.model import Record, State
+from magtensor.loop.remainder.changing_matrix import changing_matrices
+from magtensor.loop.remainder.flagged import beyond_the_reference, flagged_words, lasting
+from magtensor.loop.remainder.gradient_shape import MODEL, gradient_share
+from magtensor.loop.remainder.jitter import jitter_words
+from magtensor.loop.remainder.predictable import attitude_words, converter_words, shortened_words
+from magtensor.loop.searching.contribution import happens_once
+from magtensor.loop.searching.found import Search
+from magtensor.loop.searching.gates import Candidate
+from magtensor.loop.searching.latent import shared_words
+
+ALPHA = 0.001  # of each of the tests
+OF_A_LINE = 0.1  # of the square of what is left above the noise: less than that says nothing of its cause
+MUCH = 3.0  # times the white noise of an output: no base station beside a site differs by so much unnoticed
+TWICE = 2.0  # what the slow noise of the sensors, known from few frequencies, makes of it
+LOUD = 2.0  # times the usual noise
+LEAST_LOUD = 50  # samples
+NOISE = "what is left is noise: white, and slow noise of each sensor alone or of the reference"
+
+
+def unexplained(found: Search, record: Record) -> dict[str, Any]:
+    """The `unexplained` block of the contract."""
+    state = found.told
+    excess = excess_rms(state)
+    last = found.steps[-1].candidates if found.steps else ()
+    seen = [c for c in last if c.passes or unlikely(c)]
+    flagged = lasting(~state.fit.keep, beyond_the_reference(state, record))
+    if flagged.any():  # while effects were sought, what lasts was believed
+        seen = [c for c in seen if _still_significant(c, state)]
+    suspects = [c for c in seen if not (c.of_the_log or c.of_second_order or c.of_the_law)]
+    words: list[str] = []
+    shared = found.shared
+    # noise that grows louder makes a small one by chance, which predicts nothing
+    if shared is not None and shared.significant and (shared.gain.consistent or shared.share > OF_A_LINE):
+        words.append(shared_words(shared, record.sensors))
+    line = strongest_line(state, record)
+    # where the platform turns steadily, what is no tone has a small line too
+    if line is not None and line[1] ** 2 >= OF_A_LINE * excess**2:
+        words.append(f"a line at {line[0]:.4g} Hz (period {1 / line[0]:.4g} s), {line[1]:.3g} nT rms")
+    following = attitude_words(state)
+    words.extend(following or converter_words(state))
+    words.extend(shortened_words(state))
+    words.extend(jitter_words(state))
+    words.extend(one.words for one in changing_matrices(state, ALPHA))
+    noise = float(np.hypot(OwnNoise(state.residual, None).slow_along(), of_the_station(state, record)))
+    if (slow := slow_along(state)) > max(MUCH * state.residual.scale, TWICE * noise):
+        words.append(
+            f"{slow:.3g} nT rms of |b| - F, in all sensors alike, is no white noise: an error of the base station, or "
+            "a field at the site that it does not see"
+        )
+    gradient = gradient_share(state, record.position)
+    refused = found.steps[-1].refused if found.steps else {}
+    if open_ := [c.model.name for c in suspects if c.passes]:
+        named = [f"{name} ({refused[name]})" if name in refused else name for name in open_]
+        words.append(f"significant, passes the first two gates of the loop and is not adopted: {', '.join(named)}")
+    if useless := [c.model.name for c in suspects if not c.passes]:
+        words.append(f"significant but of no use on held-out blocks: {', '.join(useless)}")
+    shaped = bool(words) and gradient > 0
+    if shaped:
+        lacks = " and ".join(found.not_tested.get(MODEL, ()))
+        words.append(
+            f"{gradient:.0%} of what differs between the sensors has the shape of a uniform gradient of the field"
+            + (f": {MODEL}, which cannot be tested without {lacks}, would look like this" if lacks else "")
+        )
+    if words:
+        size = f"{excess:.3g} nT rms above the white noise, {_on_sensors(state)}"
+        words.insert(0, size if excess else "in sum no more than the white noise")
+    beside = loud_words(state, record)
+    if flagged.any():
+        left_out, noise = flagged_words(flagged, state, record)
+        (beside if noise else words).append(left_out)
+    present = bool(words)
+    untested = [MODEL] if shaped and MODEL in found.not_tested else []
+    return {
+        "present": present,
+        "excess_rms_nT": excess,
+        "description": "; ".join([*(words if present else noise_words(state, record)), *beside]),
+        "looks_like": untested + _looks_like(last) if present else [],
+    }
+
+
+def unlikely(candidate: Candidate) -> bool:
+    """Whether no noise explains a model, whatever it predicts."""
+    return max(candidate.adjusted_p, candidate.adjusted_own_p) < candidate.alpha and candidate.adjusted_null_p < ALPHA
+
+
+def noise_words(state: State, record: Record) -> list[str]:
+    """What is left where nothing is unexplained, and what of it is not white where that is more than what is."""
+    residual, white, words = state.residual, state.residual.scale, [NOISE]
+    if residual.across is not None:
+        values = len(residual.across) * (residual.freedom - (residual.along is not None))
+        slow = white * max(float(np.sum(residual.across**2)) / values - 1.0, 0.0) ** 0.5
+        if slow > white:
+            words.append(f"{slow:.3g} nT rms is not white, {_on_sensors(state)}")
+    if (slow := slow_along(state)) > white:
+        station = of_the_station(state, record)
+        theirs = f": the base station's own noise makes {station:.2g} nT of it" if TWICE * station > slow else ""
+        words.append(f"{slow:.3g} nT rms of |b| - F is not white{theirs}")
+    return words
+
+
+def of_the_station(state: State, record: Record) -> float:
+    """nT rms of the total field that the base station's own white noise makes between its readings; 0 without one."""
+    if record.total_field is None or record.quiet_field is None:
+        return 0.0
+    loud = (record.total_field - record.quiet_field)[state.residual.samples]
+    return float(np.sqrt(np.mean((loud - loud.mean()) ** 2)))
+
+
+def slow_along(state: State) -> float:
+    """nT rms of |b| - F beyond white noise; 0 without a total field."""
+    residual = state.residual
+    if residual.along is None:
+        return 0.0
+    return max(float(np.mean((residual.along**2 - 1.0) / residual.reference_gain**2)), 0.0) ** 0.5
+
+
+def loud_words(state: State, record: Record) -> list[str]:
+    """Where the noise of a sensor is louder for a while: no effect, but worth a look."""
+    from scipy.ndimage import median_filter
+
+    residual = state.residual
+    if residual.across is None or len(residual.across) < 4 * LEAST_LOUD:
+        return []
+    names = state.excitation.sensors
+    pairs = (
+        [(" and ".join(names), slice(None))]
+        if len(names) == 2
+        else [  # two have one contrast
+            (name, slice(3 * number, 3 * number + 3)) for number, name in enumerate(names)
+        ]
+    )
+    words = []
+    for name, own in pairs:
+        rough = np.sum(np.diff(residual.across[:, own], axis=0) ** 2, axis=1)
+        rough = median_filter(rough, size=ABOUT, mode="mirror")
+        usual = float(np.median(rough))
+        loud = rough > LOUD**2 * usual
+        edges = np.flatnonzero(np.diff(loud.astype(int), prepend=0, append=0)).reshape(-1, 2)
+        found = [(first, end) for first, end in edges if end - first >= LEAST_LOUD]
+        if not found:
+            continue
+        first, end = max(found, key=lambda stretch: stretch[1] - stretch[0])
+        begin, until = (record.time[residual.samples[i]] - record.start for i in (first, end))
+        times = float(np.sqrt(np.median(rough[first:end]) / usual))
+        others = f", and in {len(found) - 1} shorter stretches" if len(found) > 1 else ""
+        words.append(
+            f"from {begin:.5g} to {until:.5g} s the noise of {name} is {times:.2g} times as loud as usual{others}"
+        )
+    return words
+
+
+def excess_rms(state: State) -> float:
+    """nT rms of the residual above the white noise."""
+    return float(np.sqrt(max(state.residual.square() - 1.0, 0.0)) * state.residual.scale)
+
+
+def _still_significant(candidate: Candidate, state: State) -> bool:
+    """Whether a model is asked for by the samples that are still in use."""
+    from magtensor.loop.evidence.grams import Whitened
+
+    terms = candidate.model.terms(state.excitation).at(state.residual.samples)
+    white = Whitened.of(state.residual, state.colours.across, state.colours.along, state.terms)
+    now = assess(white, terms, once=happens_once(candidate.model))
+    p = max(now.p, now.own_p)
+    return p * candidate.tried < candidate.alpha and now.null_p * candidate.tried < ALPHA
+
+
+def strongest_line(state: State, record: Record) -> tuple[float, float] | None:
+    """Frequency in Hz and rms in nT of a spectral line that noise does not make; None without one."""
+    lines = spectral_lines(state.residual, record.time[state.residual.samples])
+    return (lines[0][0], lines[0][1]) if lines and lines[0][2] < ALPHA else None
+
+
+def _on_sensors(state: State) -> str:
+    """Words for the sensors that hold most of what is left."""
+    across = state.residual.across
+    if across is None:
+        return f"on {', '.join(state.excitation.sensors)}"
+    each = np.mean(across.reshape(len(across), -1, 3) ** 2, axis=(0, 2))
+    order = np.argsort(-each)
+    top = [i for i in order if each[i] > 0.7 * each[order[0]]]
+    if len(top) == len(each):
+        return "on all sensors"
+    return f"mostly on {', '.join(state.excitation.sensors[i] for i in sorted(top))}"
+
+
+def _looks_like(candidates: Sequence[Candidate]) -> list[str]:
+    """The models that come nearest to explaining it, most significant first."""
+    near = sorted((c for c in candidates if c.adjusted_p < 0.05), key=lambda c: c.adjusted_p)
+    return [c.model.name for c in near[:5]]
