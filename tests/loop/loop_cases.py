@@ -109,9 +109,11 @@ def suspects(verdict: dict[str, Any]) -> set[str]:
     return adopted_names(verdict) | {n for a in verdict["adopted"] for n in a["indistinguishable_from"]}
 
 
-def loaded(folder: Path, description: dict[str, Any]) -> Record:
-    """The record of a survey as the loop sees it."""
+def loaded(folder: Path, description: dict[str, Any], change: Callable[[Path], None] | None = None) -> Record:
+    """The record of a survey as the loop sees it; `change` may spoil its file before."""
     path = survey_file(folder, description)
+    if change is not None:
+        change(path)
     return record_of(load_as(read_plan(RECIPE, survey=path), path))
 
 

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
-from loop_cases import BASE, Array, adopted_names, loaded, scenario, verdict_of
+from loop_cases import BASE, Array, adopted_names, linear_state, loaded, scenario, verdict_of
+from scipy.signal import StateSpace, lsim
 from scipy.spatial.transform import Rotation
 
-from magtensor.error_models.direction import turning_Hz
+from magtensor.error_models.direction import turning_Hz, turning_line
+from magtensor.loop.evidence.spectrum import spectral_lines
 from magtensor.loop.fitting.model import Adopted, Fitting
 from magtensor.loop.fitting.refit import joint_state
+from magtensor.loop.remainder.tones import of_the_turning, tones
 from magtensor.loop.searching.overshadowed import _of_the_attitude
 from magtensor.registry import Registry
 
@@ -28,8 +33,8 @@ def turned(time: Array) -> Array:
     return out
 
 
-def steady_with_a_dead_zone(path: Path) -> None:
-    """Outputs of sensors that turn steadily and answer less where an axis sees little field."""
+def steady(path: Path, added: Callable[[Array, Array, Array], Array]) -> None:
+    """Outputs of sensors that turn steadily, and of what is added to them: of time, outputs and sizes of each."""
     with h5py.File(path, "a") as file:
         time, truth = file["time"][:] - file["time"][0], file["truth"]
         field = turned(time) * truth["total_field_true"][:][:, None]
@@ -37,17 +42,66 @@ def steady_with_a_dead_zone(path: Path) -> None:
         noise = 0.15 * np.random.default_rng(81).standard_normal(clean.shape)
         size = np.random.default_rng(72).uniform(0.3, 1.0, clean.shape[1:])
         size *= np.random.default_rng(73).choice([-1.0, 1.0], clean.shape[1:])
-        file["b_raw"][:] = clean + noise - size * np.tanh(clean / 6000.0)
+        file["b_raw"][:] = clean + noise + added(time, clean, size)
+
+
+def dead_zone(time: Array, clean: Array, size: Array) -> Array:
+    """Of sensors that answer less where an axis sees little field."""
+    out: Array = -size * np.tanh(clean / 6000.0)
+    return out
+
+
+def swinging(time: Array, clean: Array, size: Array) -> Array:
+    """The field of a magnetised part that swings with a period of 9 s as the platform tilts."""
+    down = Rotation.from_euler("ZYX", time[:, None] * RATES + np.array([0.4, 2.0, 5.0])).inv().apply([0.0, 0.0, -1.0])
+    rate = 2.0 * np.pi / 9.0
+    swing = StateSpace([[0.0, 1.0], [-(rate**2), -0.1 * rate]], [[0.0], [rate**2]], [[1.0, 0.0]], [[0.0]])
+    out: Array = 2.0 * size * lsim(swing, down[:, 0], time)[1][:, None, None]
+    return out
+
+
+def motor(time: Array, clean: Array, size: Array) -> Array:
+    """Of a motor, at a frequency at which nothing turns."""
+    out: Array = 0.5 * size * np.sin(2.0 * np.pi * 0.2137 * time[:, None, None] + size)
+    return out
 
 
 @pytest.mark.long
 def test_a_dead_zone_is_no_tone(tmp_path: Path) -> None:
-    told = verdict_of(tmp_path, scenario(71), steady_with_a_dead_zone, ["nonlinearity_cubic", "periodic_interference"])
+    models = ["nonlinearity_cubic", "periodic_interference"]
+    told = verdict_of(tmp_path, scenario(71), partial(steady, added=dead_zone), models)
     assert "periodic_interference" in [s["adopted"] for s in told["steps"]]  # what this is about
     assert "periodic_interference" not in adopted_names(told)
     why = {r["error_model"]: r["why"] for r in told["rejected"]}["periodic_interference"]
     assert "harmonic of the platform's turning" in why
     assert told["unexplained"]["present"]
+
+
+def test_lines_of_a_part_that_swings_are_no_tones(tmp_path: Path) -> None:
+    record = loaded(tmp_path, scenario(75), partial(steady, added=swinging))
+    state = linear_state(record)
+    strongest, _, p = spectral_lines(state.residual, record.time[state.residual.samples])[0]
+    assert p < 1e-9  # what this is about
+    assert strongest not in tones(state, record.time)
+
+
+def test_a_tone_on_a_platform_that_turns_steadily_is_found(tmp_path: Path) -> None:
+    told = verdict_of(tmp_path, scenario(75), partial(steady, added=motor), ["periodic_interference"])
+    (adopted,) = told["adopted"]
+    assert adopted["settings"]["frequency_Hz"] == pytest.approx(0.2137, abs=1e-4)
+    assert not told["unexplained"]["present"]
+
+
+def test_where_the_turning_has_lines(tmp_path: Path) -> None:
+    record = loaded(tmp_path, scenario(74))
+    time = record.time - record.time[0]
+    seen = Rotation.from_euler("Z", (2 * np.pi * 0.02 * time)[:, None]).inv().apply([1.0, 0.0, 0.0])
+    field = np.repeat(5e4 * seen[:, None], len(record.sensors), axis=1)
+    x = replace(record.excitation(field, field), attitude=None, logged={})
+    assert turning_line(x, 0.04) == pytest.approx(0.5, rel=0.02)  # of cos(a)^2, and of cos(a) sin(a)
+    assert turning_line(x, 0.033) < 1e-5
+    assert of_the_turning(x, 0.04, rms_nT=10.0)
+    assert not of_the_turning(x, 0.04, rms_nT=1000.0)  # a fiftieth of the field is no such law
 
 
 @pytest.mark.parametrize(("frequency", "doubted"), [(0.05, True), (0.9, False)])

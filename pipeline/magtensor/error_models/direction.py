@@ -8,6 +8,10 @@ from magtensor.attitude import into_platform
 from magtensor.calibration.types import Array
 from magtensor.error_models.excitation import VECTORS, Excitation
 
+LINE = 20.0  # power over the median of what is beside it: one in ten thousand by chance, in the largest of a hundred
+WIDTH = 4  # frequencies, a survey's length apart, beyond which the window shows nothing of a line
+BESIDE = np.concatenate([-np.arange(WIDTH, 31), np.arange(WIDTH, 31)])  # such frequencies
+
 
 def direction_series(x: Excitation) -> Array:
     """(N, K): second and third degree of the field's direction, and its rate of change.
@@ -44,6 +48,26 @@ def turning_Hz(x: Excitation) -> float:
         axes = [into_platform(x.attitude, axis) for axis in np.eye(3)]
     squares = sum(np.mean(np.sum(x.derivative(axis) ** 2, axis=1)) for axis in axes)
     return float(np.sqrt(squares / (2.0 if len(axes) == 3 else 1.0)) / (2.0 * np.pi))  # three axes show a turn twice
+
+
+def turning_line(x: Excitation, frequency_Hz: float) -> float:
+    """The largest amplitude with which the attitude, in units of its own series, has a line at a frequency; 0 where
+    none of them has. Any law of the attitude has one there, with a memory or without."""
+    series = attitude_series(x)
+    window = np.blackman(len(series) + 2)[1:-1]
+    window /= window.sum()
+    series = series - window @ series
+
+    def amplitudes(frequencies: Array) -> Array:
+        turned = np.exp(-2j * np.pi * np.outer(frequencies, x.time - x.time[0]))
+        out: Array = 2.0 * np.abs((turned * window) @ series)
+        return out
+
+    here = amplitudes(np.array([frequency_Hz]))[0]
+    beside = amplitudes(frequency_Hz + BESIDE / max(x.duration, 1e-300))
+    next_to_it = beside[np.abs(BESIDE) == WIDTH].max(axis=0)  # larger on the skirts of another line
+    line = (here**2 > LINE * np.median(beside, axis=0) ** 2) & (here > next_to_it)
+    return float(np.max(here, initial=0.0, where=line))
 
 
 def _unit(vectors: Array) -> Array:

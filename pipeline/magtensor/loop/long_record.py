@@ -13,10 +13,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from magtensor.calibration.joint import JointFit
-from magtensor.loop.evidence.spectrum import spectral_lines
 from magtensor.loop.fitting.model import Adopted, Fitting, Record
 from magtensor.loop.fitting.refit import joint_state
 from magtensor.loop.fitting.wandering import unweighed
+from magtensor.loop.remainder.tones import tones
 from magtensor.loop.searching.found import Search
 from magtensor.loop.searching.latent import renewed
 
@@ -44,7 +44,7 @@ def part_of(record: Record, declared: Sequence[Adopted], how: Fitting, most: int
     if step == 1:
         return Part(record)
     every = joint_state(record, declared, how)
-    lines = tuple(f for f, _, _ in spectral_lines(every.residual, record.time[every.residual.samples]))
+    lines = tones(every, record.time)
     return Part(record.at(np.arange(step // 2, len(record.time), step)), every.fit, lines)
 
 

@@ -9,11 +9,11 @@ from magtensor.components import Component
 from magtensor.error_models.excitation import Excitation
 from magtensor.error_models.needs import missing
 from magtensor.errors import DataError
-from magtensor.loop.evidence.spectrum import spectral_lines
 from magtensor.loop.fitting.log_noise import channels_of
 from magtensor.loop.fitting.model import Fitting, Record, State, generic
 from magtensor.loop.fitting.trial import Trial, on_the_folds_of, per_sample, trial
 from magtensor.loop.remainder.changing_matrix import channel_instead
+from magtensor.loop.remainder.tones import tones
 from magtensor.loop.searching.adopting import adopt, narrowed, polished
 from magtensor.loop.searching.contribution import (
     agrees,
@@ -318,5 +318,5 @@ def testable(x: Excitation, models: Sequence[Component]) -> list[Component]:
 def with_lines(state: State, record: Record, lines: Sequence[float] | None = None) -> State:
     """The state, its excitation knowing the strongest lines in the spectrum of what is left, or those given."""
     if lines is None:
-        lines = [f for f, _, _ in spectral_lines(state.residual, record.time[state.residual.samples])]
+        lines = tones(state, record.time)
     return replace(state, excitation=replace(state.excitation, lines=tuple(lines)))

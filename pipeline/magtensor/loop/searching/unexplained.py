@@ -22,6 +22,7 @@ from magtensor.loop.remainder.flagged import beyond_the_reference, flagged_words
 from magtensor.loop.remainder.gradient_shape import MODEL, gradient_share
 from magtensor.loop.remainder.jitter import jitter_words
 from magtensor.loop.remainder.predictable import attitude_words, converter_words, shortened_words
+from magtensor.loop.remainder.tones import of_the_turning
 from magtensor.loop.searching.contribution import happens_once
 from magtensor.loop.searching.found import Search
 from magtensor.loop.searching.gates import Candidate
@@ -54,7 +55,8 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
     line = strongest_line(state, record)
     # where the platform turns steadily, what is no tone has a small line too
     if line is not None and line[1] ** 2 >= OF_A_LINE * excess**2:
-        words.append(f"a line at {line[0]:.4g} Hz (period {1 / line[0]:.4g} s), {line[1]:.3g} nT rms")
+        too = ", where the platform's turning has one too" if of_the_turning(state.excitation, *line) else ""
+        words.append(f"a line at {line[0]:.4g} Hz (period {1 / line[0]:.4g} s), {line[1]:.3g} nT rms{too}")
     following = attitude_words(state)
     words.extend(following or converter_words(state))
     words.extend(shortened_words(state))

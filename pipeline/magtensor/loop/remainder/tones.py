@@ -1,0 +1,31 @@
+"""Lines in the spectrum of what is left, and which of them may be the platform's turning.
+
+Where a platform turns steadily any law of the attitude has lines, and one with a memory (a part that swings, a filter)
+has them in other phases than the monomials of the attitude. So a line at a frequency at which the attitude has one too
+is no evidence of a tone, unless it is larger than any such law would make it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from magtensor.calibration.types import Array
+from magtensor.error_models.direction import turning_line
+from magtensor.error_models.excitation import Excitation
+from magtensor.loop.evidence.spectrum import spectral_lines
+from magtensor.loop.fitting.model import State
+
+MOST = 5  # lines that are looked for tones at
+LARGEST_LAW = 0.01  # of the field, that a law of the attitude makes of an attitude's line
+
+
+def tones(state: State, time: Array) -> tuple[float, ...]:
+    """Hz of the strongest lines that are no more than likely the turning's, `time` being that of all samples."""
+    lines = spectral_lines(state.residual, time[state.residual.samples], most=2 * MOST)
+    return tuple(f for f, rms, _ in lines if not of_the_turning(state.excitation, f, rms))[:MOST]
+
+
+def of_the_turning(x: Excitation, frequency_Hz: float, rms_nT: float) -> bool:
+    """Whether a law of the attitude may make a line of that rms."""
+    total = float(np.median(np.linalg.norm(x.field[:, 0], axis=1)))
+    return np.sqrt(2.0) * rms_nT < LARGEST_LAW * total * turning_line(x, frequency_Hz)
