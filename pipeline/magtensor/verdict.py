@@ -11,6 +11,7 @@ from magtensor.accuracy import error_block, figure
 from magtensor.survey.model import Survey
 
 SCHEMA = 1
+ERRORS = {"total_field_rms_nT": ("total field", "nT"), "tensor_rms_nT_per_m": ("tensor", "nT/m")}
 WORSE = 1.1  # times another error: clearly more
 DISAGREES = 3.0  # times the error on held-out blocks
 
@@ -79,12 +80,7 @@ def sentence(outcome: dict[str, Any]) -> str:
         refined = "The tensor was refined; its error cannot be told without a tensor that is known."
         return refined if outcome["declared"] else "Nothing was calibrated."
     figures = [
-        f"{name} {_change(before, after, key)} {unit} rms"
-        for name, key, unit in (
-            ("total field", "total_field_rms_nT", "nT"),
-            ("tensor", "tensor_rms_nT_per_m", "nT/m"),
-        )
-        if after.get(key)
+        f"{name} {_change(before, after, key)} {unit} rms" for key, (name, unit) in ERRORS.items() if after.get(key)
     ]
     floor = outcome["noise_floor_nT"]
     noise = f"; sensor noise {_figure(floor)} nT" if floor is not None else ""
@@ -94,7 +90,9 @@ def sentence(outcome: dict[str, Any]) -> str:
     by_hand = _named([a for a in outcome["adopted"] if a.get("by") == "person"])
     left = outcome["unexplained"]
     if adopted:
-        head = f"The residual was traced to {', '.join(adopted)}"
+        rises = [_of_all(after, key) > _of_all(before or {}, key) for key in ERRORS if _of_all(before or {}, key)]
+        head = "No error falls, but the residual looks like" if rises and all(rises) else "The residual was traced to"
+        head += f" {', '.join(adopted)}"
         head += f"; adopted by hand: {', '.join(by_hand)}" if by_hand else ""
     elif by_hand:
         head = f"Adopted by hand: {', '.join(by_hand)}"
@@ -157,6 +155,11 @@ def _judged(outcome: dict[str, Any]) -> tuple[str, dict[str, Any] | None, dict[s
         if blocks and blocks.get("after"):
             return where, blocks["before"], blocks["after"]
     return "on the survey it was fitted to", None, error.get("fit")
+
+
+def _of_all(block: dict[str, Any], key: str) -> float:
+    """An error of all sensors or components; 0 where it is not known."""
+    return float((block.get(key) or {}).get("all") or 0.0)
 
 
 def _change(before: dict[str, Any] | None, after: dict[str, Any], key: str) -> str:

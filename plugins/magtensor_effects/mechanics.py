@@ -10,7 +10,7 @@ from magtensor.calibration.types import Array
 from magtensor.components import error_model
 from magtensor.error_models.acting import AXES
 from magtensor.error_models.excitation import Excitation
-from magtensor.error_models.settings import Orders, Range
+from magtensor.error_models.settings import LagsOf, Orders, Range
 from magtensor.error_models.terms import Terms, joined
 from magtensor.units import GRAVITY
 from magtensor_effects.ageing import EventTime, Span
@@ -38,7 +38,7 @@ def frame_flexure(
     *,
     lag_s: Annotated[
         float,
-        Range(0.0, 30.0, count=6, spacing="log"),
+        LagsOf(0.0, 30.0, count=6, spacing="log", channel="acceleration"),
         Field(ge=0, description="time constant of a frame that gives way late, s"),
     ] = 0.0,
 ) -> Terms:

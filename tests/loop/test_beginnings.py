@@ -8,10 +8,11 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
-from loop_cases import BASE, lasting_effects, scenario, survey_file, verdict_of
+from loop_cases import BASE, lasting_effects, linear_state, loaded, scenario, survey_file, verdict_of
 
 from magtensor import close_loop
 from magtensor.error_models.example import example_survey
+from magtensor.loop.searching.beginnings import at_its_limit
 from magtensor.registry import Registry
 
 TAU_S = 150.0
@@ -141,3 +142,13 @@ def test_what_dies_away_is_no_response_to_the_temperature_that_began_with_it(see
     (adopted,) = verdict_of(tmp_path, scenario(seed, effect, **changes), models=models)["adopted"]
     assert adopted["error_model"] == "warm_up" and adopted["sensors"] == ["S1", "S4"]
     assert adopted["settings"]["tau_s"] == pytest.approx(150.0, rel=0.1)
+
+
+@pytest.mark.parametrize(("part", "limit"), [(1.0, True), (-1.0, True), (0.9, False), (0.0, False)])
+def test_a_beginning_at_its_limit_is_none(part: float, limit: bool, tmp_path: Path) -> None:
+    x = linear_state(loaded(tmp_path, scenario(65))).excitation
+    model = Registry.load().find("error_model", "temperature_offset")
+    widest = 10.0 * float(np.ptp(x.logged["temperature"]))  # as docs/loop.md says
+    settings = {"order": 1, "channel": "temperature", "lag_s": 60.0, "delayed": False, "at_start": part * widest}
+    assert at_its_limit(model, settings, x) is limit
+    assert not at_its_limit(model, settings | {"lag_s": 5.0, "delayed": True}, x)  # a delay has no beginning

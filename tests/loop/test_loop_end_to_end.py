@@ -8,10 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import h5py
+import numpy as np
 import pytest
 import yaml
 from loop_cases import RECIPE, adopted_names, lasting_effects, scenario, survey_file, suspects, verdict_of
 
+from magtensor import close_loop
 from magtensor.errors import DataError
 from magtensor.preparing import empty_survey
 from magtensor.recipe.plan import read_plan
@@ -148,6 +150,18 @@ def test_a_source_that_nobody_logged_is_found_and_taken_off_another_survey(tmp_p
         before, after = (found["error"]["verify"][k][figure]["all"] for k in ("before", "after"))
         assert after < 1.1 * outcome["told"]["error"]["verify"]["after"][figure]["all"]
         assert after < 0.5 * before
+
+
+def test_a_source_faster_than_the_samples_is_taken_off_another_survey(tmp_path: Path) -> None:
+    """A hum whose frequency wanders: neighbouring samples differ by the source, and not by noise."""
+    hum = {"type": "smooth", "rms": 1.0, "time_s": 0.6}
+    unlogged = {"type": "latent_source", "nT_per_unit": VECTORS, "waveform_of": hum}
+    survey, verify = (survey_file(tmp_path, scenario(seed, unlogged), f"{seed}.h5") for seed in (8, 9))
+    told = close_loop(survey, verify=verify, search=["latent_source", "offset_drift"]).verdict
+    require_latent_source_alone(told)
+    np.testing.assert_allclose(told["adopted"][0]["settings"]["noise_nT"], 0.15, rtol=0.1)
+    before, after = (told["error"]["verify"][k]["total_field_rms_nT"]["all"] for k in ("before", "after"))
+    assert after < 0.5 * before
 
 
 def require_latent_source_alone(found: Verdict) -> None:

@@ -14,7 +14,8 @@ from scipy.signal import lfilter
 
 from magtensor.loop.fitting.model import Adopted, Fitting
 from magtensor.loop.fitting.refit import joint_state
-from magtensor.loop.searching import rounds, search
+from magtensor.loop.searching import overshadowed, rounds, search
+from magtensor.loop.searching.contribution import borne_out
 from magtensor.loop.searching.found import Search
 from magtensor.loop.searching.overshadowed import attitude_share
 from magtensor.registry import Registry
@@ -159,3 +160,24 @@ def test_a_source_in_the_place_of_a_step_may_cost_samples_that_do_not_make_it_be
     given: Any = None
     found = rounds._source_instead(given, given, before, left, given, 0, 0.005)
     assert (found is not None) == kept
+
+
+def test_a_response_to_the_acceleration_follows_the_attitude_through_any_lag(tmp_path: Path) -> None:
+    logging = {"attitude": True, "acceleration": True}
+    record = loaded(tmp_path, scenario(86, {"type": "offset_drift", "rms_nT": 1.0}, logging=logging))
+    model = Registry.load().find("error_model", "channel_response")
+    for channel, follows in (("acceleration", True), ("temperature", False)):
+        state = joint_state(record, [Adopted(model, {"channel": channel, "power": 2, "lag_s": 400.0})], Fitting())
+        assert overshadowed._follows_a_vector(state, [0]) is follows
+        assert overshadowed._of_the_attitude(state, [0]) or not follows
+
+
+@pytest.mark.parametrize(("effects", "kept"), [([], False), ([{"type": "temperature_offset", "rms_nT": 1.0}], True)])
+def test_what_is_left_after_others_are_taken_out_has_to_serve(
+    effects: list[dict[str, Any]], kept: bool, tmp_path: Path
+) -> None:
+    record = loaded(tmp_path, scenario(87, *effects))
+    model = Adopted(Registry.load().find("error_model", "temperature_offset"), {"order": 1, "channel": "temperature"})
+    state, dropped = borne_out(record, joint_state(record, [model], Fitting()), Fitting(), 0)
+    assert [a.name for a in state.adopted] == ["temperature_offset"] * kept
+    assert dropped == ("temperature_offset",) * (not kept)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -108,6 +109,28 @@ def test_a_line_is_told_where_it_is_much_of_what_is_left(wandering_nT: float, to
     added[:, 2] = wandering_nT * walk / walk.std(axis=0)
     words = str(told(synthetic(4, SAMPLES, turning_s=4.0, noise_nT=0.15, added=added))["description"])
     assert ("a line at 0.137 Hz" in words) is told_of
+
+
+@pytest.mark.parametrize(
+    ("total_field", "tensor", "head"),
+    [(1.0, 1.0, "traced to"), (1.04, 0.9, "traced to"), (1.04, 1.1, "No error falls"), (1.04, None, "No error falls")],
+)
+def test_what_lowers_no_error_is_not_called_traced(total_field: float, tensor: float | None, head: str) -> None:
+    def block(total: float, of_tensor: float | None) -> dict[str, Any]:
+        return {
+            "total_field_rms_nT": {"all": total},
+            "tensor_rms_nT_per_m": None if of_tensor is None else {"all": of_tensor},
+        }
+
+    before, after = block(1.0, None if tensor is None else 1.0), block(total_field, tensor)
+    outcome = {
+        "declared": ["linear"],
+        "adopted": [{"error_model": "temperature_scale", "settings": {}, "kind": "instrument"}],
+        "noise_floor_nT": 0.1,
+        "unexplained": {"present": True, "description": "much", "excess_rms_nT": 3.0, "looks_like": []},
+        "error": {"fit": after, "held_out": {"before": before, "after": after}},
+    }
+    assert head in sentence(outcome)
 
 
 def test_what_was_adopted_more_than_once_is_counted_and_a_channel_named() -> None:

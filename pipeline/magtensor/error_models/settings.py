@@ -58,6 +58,23 @@ class Range:
 
 
 @dataclass(frozen=True)
+class LagsOf(Range):
+    """Time constants of a response to a logged vector, tried only where it changes within the runs of a survey: where
+    every run stands still a lag is no more than a mean over the noise of the log.
+
+    Attributes:
+        channel: its name.
+    """
+
+    channel: str = ""
+
+    def values(self, x: Excitation) -> list[Any]:
+        """The grid for a survey."""
+        still = self.channel in x.logged and not x.changes_within_runs(self.channel)
+        return [self.low] if still else super().values(x)
+
+
+@dataclass(frozen=True)
 class Delays(Range):
     """Delays of the base station, s, that its readings can show: they reach all but a fifth of the samples then.
 

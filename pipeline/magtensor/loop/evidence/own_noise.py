@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from magtensor.calibration.types import Array
 from magtensor.error_models.terms import REFERENCE, Terms, joined
 from magtensor.loop.evidence.columns import across_directions, along_the_field
+from magtensor.loop.evidence.one_coefficient import one_coefficient_p
 from magtensor.loop.evidence.residual import Residual
 from magtensor.loop.evidence.statistics import Own, identifiable
 
@@ -53,10 +54,13 @@ class OwnNoise:
         frequencies where they are slow. In one band what is explained is then a share of as many values as the level is
         known from (Satterthwaite 1946): beta-distributed, like the squared multiple correlation. Where bands of
         few and of many values come together that share has no bound of one, and would be far too unlikely; chi-square,
-        as if the levels were known, errs to the other side in one band. The larger of both is taken.
+        as if the levels were known, errs to the other side in one band. The larger of both is taken. Of one coefficient
+        of the reference the exact law is known (`one_coefficient`).
         """
         from scipy.special import betaincc, chdtrc
 
+        if terms.count == 1 and np.all(terms.part_output == REFERENCE) and self.residual.sighted is None:
+            return self._of_one_in_the_reference(terms)
         every = terms if self.given is None else joined([self.given, terms])
         across, along = self._across_of(every), self._along_of(every)
         size = every.count if across is None else across.into.shape[1]
@@ -87,6 +91,27 @@ class OwnNoise:
         explained = float(found @ inverse @ found)
         share_of_all = min(explained / freedom, 1.0)
         return max(float(betaincc(rank / 2.0, (freedom - rank) / 2.0, share_of_all)), float(chdtrc(rank, explained)))
+
+    def _of_one_in_the_reference(self, terms: Terms) -> float:
+        """The same of a single coefficient that is seen in |b| - F alone, octave by octave."""
+        if self.residual.along is None:
+            return 1.0
+        count = len(self._along)
+        every = terms if self.given is None else joined([terms, self.given])
+        series = _frequencies(self._even(along_the_field(self.residual, [every]).made)) / self._root_along[:, None]
+        column, others = series[:, 0], series[:, 1:]
+        free = self._free_along
+        more, size, _ = np.linalg.svd(others - free @ (free.T @ others), full_matrices=False)
+        taken = np.column_stack([free, more[:, size > _INNER_RANK * max(size.max(initial=0.0), 1.0)]])
+        column, values = (each - taken @ (taken.T @ each) for each in (column, self._values_along))
+        octaves = 1 + OCTAVE * 2 ** np.arange(max(int(np.log2(count)), 1))
+        edges = np.concatenate([[1], octaves[octaves < count // 2], [count]])
+
+        def sums(each: Array) -> Array:
+            return np.add.reduceat(each, edges[:-1])
+
+        left = np.diff(edges) - sums(np.sum(taken**2, axis=1))
+        return one_coefficient_p(left, sums(column * values), sums(column**2), sums(values**2))
 
     def slow_std(self) -> Array:
         """(3 S,) nT, rms of the slow noise of each output beside its white noise; 0 of a single sensor."""

@@ -44,6 +44,15 @@ def extent(model: Component, settings: Mapping[str, Any], x: Excitation) -> floa
     return WIDEST * float(np.ptp(x.channel(grid.pick(x, str(settings[name]))), axis=0).max())
 
 
+def at_its_limit(model: Component, settings: Mapping[str, Any], x: Excitation) -> bool:
+    """Whether a response began as far out of equilibrium as it may at most: then something else dies away."""
+    found = beginning(model, settings)
+    if found is None:
+        return False
+    most = (1.0 - _SLOPE) * extent(model, settings, x)
+    return any(abs(settings[name]) >= most for name in found[0])
+
+
 def with_beginning(
     white: Whitened,
     terms: Callable[[Mapping[str, Any]], Terms],

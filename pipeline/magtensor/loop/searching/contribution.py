@@ -20,7 +20,8 @@ from magtensor.loop.evidence.residual import Residual, taken_off
 from magtensor.loop.evidence.statistics import Gain, concentrated, family_p, focused_gain, held_out_gain
 from magtensor.loop.fitting.model import Adopted, Fitting, Record, State
 from magtensor.loop.fitting.refit import joint_state
-from magtensor.loop.fitting.trial import WORST_RISE
+from magtensor.loop.fitting.trial import WORST_RISE, on_the_folds_of, trial
+from magtensor.loop.searching.beginnings import at_its_limit
 
 LEAST_FALL = 5e-4  # of the error on held-out blocks, by what lasts: 3 % of the noise is no effect anybody would miss
 APART_ALPHA = 1e-4  # what differs between sensors has to be as unlikely, before an effect of all is not the reference's
@@ -143,6 +144,28 @@ def eliminate(record: Record, state: State, how: Fitting, fixed: int) -> tuple[S
     return state, tuple(dropped)
 
 
+def borne_out(record: Record, state: State, how: Fitting, fixed: int) -> tuple[State, tuple[str, ...]]:
+    """Without those adopted models that make the calibration worse for blocks it was not fitted to, each of them fitted
+    anew. Every one passed this gate when it was adopted, but beside others that have been taken out since."""
+    dropped: list[str] = []
+    while len(state.adopted) > fixed:
+        now = trial(record, state, how)
+        rises = {}
+        for place in range(fixed, len(state.adopted)):
+            without = trial(record, without_models(record, state, [place], how), how)
+            without = on_the_folds_of(now, record, without, how)
+            if now.error is not None and without.error is not None:
+                errors = (np.array([t.error[s] for s in record.sensors]) for t in (now, without) if t.error)
+                after, before = (float(np.sqrt(np.mean(e**2))) for e in errors)
+                rises[place] = after / before / (1.0 if _lasts(state.adopted[place]) else 1.0 + WORST_RISE)
+        worst = max(rises, key=lambda place: rises[place], default=None)
+        if worst is None or rises[worst] <= 1.0:
+            break
+        dropped.append(state.adopted[worst].name)
+        state = without_models(record, state, [worst], how)
+    return state, tuple(dropped)
+
+
 def _of_an_event(state: State, place: int) -> float:
     """P value of an adopted model of what happened once, beside the others, all times corrected for at which it might
     have: its part in two or three blocks has no scatter."""
@@ -188,8 +211,11 @@ def a_tone(model: Adopted) -> bool:
 
 
 def agrees(state: State, place: int) -> bool:
-    """Whether the coefficients of an adopted model are what its settings assume, and explain what they then must."""
+    """Whether the coefficients of an adopted model are what its settings assume, and explain what they then must; and
+    whether it began as a response may."""
     model = state.adopted[place]
+    if at_its_limit(model.component, model.settings, state.excitation):
+        return False
     test = model.component.agrees
     return test is None or test(model.settings, state.theta[place], explained_share(state, place))
 

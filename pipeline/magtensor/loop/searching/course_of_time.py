@@ -20,7 +20,7 @@ from magtensor.error_models.excitation import Excitation
 from magtensor.error_models.settings import Beginning, Choice, Orders, Range, profiled
 from magtensor.error_models.terms import Terms, joined
 from magtensor.loop.evidence.assessment import WHITE, colours_of, estimated, explained
-from magtensor.loop.evidence.residual import taken_off
+from magtensor.loop.evidence.residual import Residual, taken_off
 from magtensor.loop.fitting.log_noise import channels_of
 from magtensor.loop.fitting.model import Adopted, State
 from magtensor.loop.searching.beginnings import beginning, one_pattern
@@ -67,16 +67,17 @@ def beside_time(candidate: Candidate, state: State) -> BesideTime:
     every = joined([*held, own, courses])
     left = taken_off(residual, every, estimated(residual, every, WHITE).theta)
     colours = colours_of(left, stiff=True, above=FIRST_LEFT)
+    # what of the reference is slow, and has no name yet, is in |b| - F alone, and courses would explain it
+    between = residual if residual.across is None else replace(residual, along=None)
 
-    def explains(*terms: Terms) -> float:
-        return explained(estimated(residual, joined([*held, *terms]), colours))
+    def explains(seen: Residual, *terms: Terms) -> float:
+        return explained(estimated(seen, joined([*held, *terms]), colours))
 
-    both = explains(own, courses)
-    if _chance(both - explains(courses), own.count) < SEEN:
+    if _chance(explains(residual, own, courses) - explains(residual, courses), own.count) < SEEN:
         return BesideTime(True)
     if candidate.assessment.gain.total <= MISSED * explained_by_courses(state, candidate):
         return BesideTime(False, f"{name} explains nothing beside smooth courses of time, and a drift is adopted")
-    if _chance(both - explains(own), courses.count) < MORE:
+    if _chance(explains(between, own, courses) - explains(between, own), courses.count) < MORE:
         return BesideTime(False, f"smooth courses of time explain more than {name}, and leave it nothing")
     return BesideTime(False)
 
@@ -93,7 +94,7 @@ def _followed(model: Adopted, x: Excitation) -> str:
     if not channels:
         return "" if beginning(model.component, model.settings) is None else THE_FIELD
     (name, *others) = channels
-    return "" if others or x.is_vector(name) else name
+    return "" if others else name
 
 
 def _with_slopes(candidate: Candidate, x: Excitation) -> Terms:

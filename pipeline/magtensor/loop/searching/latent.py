@@ -197,16 +197,20 @@ def _own_noise(state: State) -> Array:
     """(3 S,) nT, white noise of the outputs beside an adopted source.
 
     From differences of neighbouring samples in which the source is left: its waveform, one value a sample, has taken
-    with it the most of the noise of those outputs that feel it most.
+    with it the most of the noise of those outputs that feel it most. Where it is so fast that they share it, it is the
+    factor beside that noise.
     """
-    found = _put_back(state)
-    assert found is not None
+    put_back = _put_back(state)
+    assert put_back is not None
     basis = free_directions(np.eye(len(state.residual.noise)) - state.residual.projector)
-    steps = np.diff(found[0] @ basis, axis=0) / np.sqrt(2.0)
+    steps = np.diff(put_back[0] @ basis, axis=0) / np.sqrt(2.0)
     size = np.sum(steps**2, axis=1)
     quiet = steps[size < QUIET * np.median(size)]  # where it does not switch
-    alone = noise_alone(quiet.T @ quiet / len(quiet), basis, _outputs(basis))
-    out: Array = state.residual.noise * np.sqrt(np.maximum(np.diag(alone.noise), LEAST_NOISE**2))
+    covariance, groups = quiet.T @ quiet / len(quiet), _outputs(basis)
+    found = noise_alone(covariance, basis, groups)
+    if found.log_p(len(quiet)) < np.log(ALPHA):
+        found = with_factor(covariance, basis, groups, found)
+    out: Array = state.residual.noise * np.sqrt(np.maximum(np.diag(found.noise), LEAST_NOISE**2))
     return out
 
 

@@ -22,6 +22,7 @@ from magtensor.error_models.terms import joined
 from magtensor.error_models.waveform import NAME
 from magtensor.loop.evidence.assessment import estimated
 from magtensor.loop.evidence.residual import taken_off
+from magtensor.loop.fitting.log_noise import channels_of
 from magtensor.loop.fitting.model import Adopted, State
 from magtensor.loop.remainder.predictable import enough_for_the_total_field, predictable_in_the_total_field
 from magtensor.loop.searching.contribution import happens_once, removal, slices
@@ -29,6 +30,7 @@ from magtensor.loop.searching.found import Search
 from magtensor.loop.searching.unexplained import unexplained, unlikely
 
 MOSTLY = 0.5  # of what an effect adds: so much of it, predicted from the attitude, follows the attitude
+NAMELESS = 2.0  # times what stays, that a response to a logged vector explains if it is the law
 ALONG = 0.95  # cosine, with a source's vector or another event's; of one sensor 5 % of all directions are as near
 HARMONICS = 16  # of the turning, that a law of the attitude with a corner shows
 
@@ -43,7 +45,9 @@ def overshadowed(found: Search, fixed: int) -> tuple[list[int], str] | None:
     for places in _of_one_name(state, fixed):
         before, after = removal(state, *places)
         amount = float(np.sqrt(max(before**2 - after**2, 0.0)))
-        if amount >= left or (weakest is not None and amount >= weakest[0]):
+        if amount >= left * (NAMELESS if _follows_a_vector(state, places) else 1.0) or (
+            weakest is not None and amount >= weakest[0]
+        ):
             continue
         if why := _of_the_attitude(state, places) or _of_what_wanders(found, state, places):
             weakest = amount, places, why
@@ -52,7 +56,8 @@ def overshadowed(found: Search, fixed: int) -> tuple[list[int], str] | None:
     if weakest is None or not present:
         return _part_of_a_source(found, fixed) or (several if present else None)
     amount, places, why = weakest
-    return places, f"it {why} and explains {amount:.3g} nT rms, less than the {left:.3g} nT that stay"
+    size = "less than" if amount < left else "hardly more than"
+    return places, f"it {why} and explains {amount:.3g} nT rms, {size} the {left:.3g} nT that stay"
 
 
 def _of_one_name(state: State, fixed: int) -> list[list[int]]:
@@ -74,7 +79,15 @@ def _of_the_attitude(state: State, places: Sequence[int]) -> str:
     frequency = _frequency(state.adopted[places[0]])
     if frequency and frequency < HARMONICS * (turning := turning_Hz(state.excitation)):
         return f"may be a harmonic of the platform's turning ({turning:.3g} Hz)"
-    return "follows the attitude" if attitude_share(state, places) > MOSTLY else ""
+    follows = _follows_a_vector(state, places) or attitude_share(state, places) > MOSTLY
+    return "follows the attitude" if follows else ""
+
+
+def _follows_a_vector(state: State, places: Sequence[int]) -> bool:
+    """Whether adopted models follow a logged vector, through whatever lag: each component with coefficients of its own,
+    they imitate most of what the attitude does."""
+    x = state.excitation
+    return any(x.is_vector(name) for place in places for name in channels_of(state.adopted[place], x))
 
 
 def _of_what_wanders(found: Search, state: State, places: Sequence[int]) -> str:

@@ -15,6 +15,7 @@ from magtensor.loop.fitting.trial import Trial, on_the_folds_of, per_sample, tri
 from magtensor.loop.remainder.changing_matrix import channel_instead
 from magtensor.loop.remainder.tones import tones
 from magtensor.loop.searching.adopting import adopt, narrowed, polished
+from magtensor.loop.searching.beginnings import at_its_limit
 from magtensor.loop.searching.contribution import (
     agrees,
     eliminate,
@@ -295,6 +296,8 @@ def _kept(record: Record, before: Trial, chosen: Candidate, how: Fitting) -> tup
     if (slow or channels) and of_all_alike(after.state, which):
         drift = "drifts" if slow else f"follows {' and '.join(channels)}"
         return None, f"fitted, all sensors show it alike: an error of the base station that {drift} would look the same"
+    if at_its_limit(model.component, model.settings, after.state.excitation):
+        return None, "fitted, it would have begun as far from what it follows as is possible: something else dies away"
     if not agrees(after.state, which):
         return None, "fitted, its coefficients are not what its settings assume"
     if how.nominal is not None and (share := share_of_the_field(after.state, which)) > how.nominal.scale:

@@ -20,7 +20,7 @@ from magtensor.loop.fitting.refit import joint_state
 from magtensor.loop.fitting.trial import on_the_folds_of, trial
 from magtensor.loop.fitting.wandering import all_noise, narrowed_to, of_sensors, quieter, unweighed
 from magtensor.loop.searching.adopting import on_those_that_show
-from magtensor.loop.searching.contribution import eliminate, without_models
+from magtensor.loop.searching.contribution import borne_out, eliminate, without_models
 from magtensor.loop.searching.found import Search, Step
 from magtensor.loop.searching.gates import ALPHA
 from magtensor.loop.searching.latent import NAME, SINGLE_STRETCH, renewed, sought
@@ -81,8 +81,9 @@ def search(
             say(f"taking {name} out again")
         record, state = renewed(record, without_models(record, found.last, places, how), how)
         state, steps = _weighed_once_more(record, state, steps, how, len(declared))
+        state, dropped = borne_out(record, state, how, len(declared))
         candidates = rounds.candidates(state := with_lines(state, record, lines), record, how)
-        step = Step(state, tuple(candidates), None, refused={name: why})
+        step = Step(state, tuple(candidates), None, refused={name: why}, dropped=dropped)
         source = None if name == NAME else rounds.with_source(record, state, how, step)[1]
         if source is not None:  # which the model that is gone was a part of
             record, state, step = source
