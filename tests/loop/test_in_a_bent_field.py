@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from loop_cases import Array
 
-from magtensor.error_models.waveform import bends, course_of
+from magtensor.error_models.waveform import bends, course_of, too_little_shows
 from magtensor.tensor.geometry import array_design
 
 CROSS = 0.25 * np.array([[1.0, 0, 0], [0, 1.0, 0], [-1.0, 0, 0], [0, -1.0, 0]])
@@ -75,3 +75,16 @@ def test_three_sensors_have_one_free_direction_and_cannot_tell() -> None:
     held = array_design(CROSS[:3], "gradient").reshape(9, -1) / NOISE_NT
     whitened, _ = outputs(passing(2.0, 30.0), 1.0)
     assert not bends(whitened[:, :9], held, VECTOR[:9] / NOISE_NT)
+
+
+@pytest.mark.parametrize(("beside", "little"), [(0.1, True), (0.2, False)])
+def test_what_is_nearly_a_gradient_shows_too_little(beside: float, little: bool) -> None:
+    """A tenth of the vector, in size, is a hundredth of its square."""
+    held = array_design(CROSS, "gradient").reshape(12, -1)
+    gradient = held @ np.random.default_rng(2).standard_normal(held.shape[1])
+    off = VECTOR - held @ np.linalg.lstsq(held, VECTOR, rcond=None)[0]
+    vector = gradient / np.linalg.norm(gradient) + beside * off / np.linalg.norm(off)
+    assert too_little_shows(held, vector) is little
+    waveform = np.sin(np.arange(SAMPLES) / 40.0)
+    noise = 1e-3 * np.random.default_rng(3).standard_normal((SAMPLES, 12))
+    assert (course_of(np.outer(waveform, vector) + noise, held, vector).rms == 0.0) is little

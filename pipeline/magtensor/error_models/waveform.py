@@ -67,9 +67,16 @@ def course_of(whitened: Array, held: Array, direction: Array, good: NDArray[np.b
     z = whitened[used] @ basis
     rest = z @ np.linalg.svd(d[None, :])[2][1:].T
     course = _filtered(z @ d / information, rest, information)
-    if information < LEAST_SHARE * float(direction @ direction) and not course.switches:
+    if too_little_shows(held, direction) and not course.switches:
         return Course(np.zeros(n), 0.0, 0.0, 0.0)
     return replace(course, values=np.interp(np.arange(n), used, course.values))
+
+
+def too_little_shows(held: Array, direction: Array) -> bool:
+    """Whether so little of a source lies in the directions in which the field moves nothing that what is seen there
+    would bring in more than it takes off, `held` and `direction` as for `course_of`."""
+    shown = free_directions(held).T @ direction
+    return bool(shown @ shown < LEAST_SHARE * float(direction @ direction))
 
 
 def bends(whitened: Array, held: Array, direction: Array) -> bool:

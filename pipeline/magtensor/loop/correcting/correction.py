@@ -12,7 +12,7 @@ from magtensor.calibration.by_sensor import by_sensor
 from magtensor.calibration.types import Array, ArrayCalibration
 from magtensor.error_models.delays import cleared, lateness, on_time, unseen
 from magtensor.error_models.terms import Terms
-from magtensor.error_models.waveform import NAME, bends, course_of
+from magtensor.error_models.waveform import NAME, bends, course_of, too_little_shows
 from magtensor.loop.correcting.another_survey import as_begun_here
 from magtensor.loop.fitting.model import Adopted, Record, State
 from magtensor.loop.fitting.refit import without
@@ -122,22 +122,27 @@ def _beside_a_field(raw: Array, calibration: ArrayCalibration, position: Array, 
     return (np.nan_to_num(raw) - calibration.offset).reshape(len(raw), -1) / noise, held
 
 
-def hidden_in_a_bent_field(
+def hidden_objection(
     record: Record,
     calibration: ArrayCalibration,
     adopted: Sequence[Adopted],
     theta: Sequence[Array],
     good: NDArray[np.bool_] | None = None,
-) -> bool:
-    """Whether a field that bends within the array would pass for the source that nobody logged on a survey."""
+) -> str:
+    """Why the source that nobody logged cannot be taken off a survey; "" where it can, or where none is known."""
     hidden = _hidden(adopted)
     if hidden is None or record.position is None:
-        return False
+        return ""
     others = [i for i in range(len(adopted)) if i != hidden]
     raw = corrected_raw(record, calibration, [adopted[i] for i in others], [theta[i] for i in others], good)
     noise, usable = _weights(adopted[hidden], raw[0].size), _usable(raw, good)
     whitened, held = _beside_a_field(raw, calibration, record.position, noise)
-    return bends(whitened[usable], held, theta[hidden] / noise)
+    direction = theta[hidden] / noise
+    if bends(whitened[usable], held, direction):
+        return "the field bends within the array, by more than it may be told from"
+    if too_little_shows(held, direction) and not course_of(whitened, held, direction, usable).switches:
+        return "as the sensors lie, nearly all of it could be a uniform field or a gradient"
+    return ""
 
 
 def as_elsewhere(record: Record, calibration: ArrayCalibration, state: State) -> Record:

@@ -16,7 +16,7 @@ from magtensor.error_models.settings import NOT_KNOWN, AnyChannel, Beginning, Du
 from magtensor.error_models.waveform import NAME
 from magtensor.errors import DataError, UsageError
 from magtensor.loop.correcting.another_survey import TONE, begins_anew, shows_a_state
-from magtensor.loop.correcting.correction import corrected_raw, corrected_reference, hidden_in_a_bent_field
+from magtensor.loop.correcting.correction import corrected_raw, corrected_reference, hidden_objection
 from magtensor.loop.correcting.lengths import AVERAGING, averaged_otherwise
 from magtensor.loop.fitting.model import Adopted, Record
 from magtensor.loop.fitting.record import record_of
@@ -135,7 +135,7 @@ def those_here(
     """The effects that another survey has too.
 
     Rows that are averages belong to the way a survey was recorded, which its lengths may refute. A source that nobody
-    logged cannot be told from a field that bends within the array.
+    logged cannot be told from a field that bends within the array, nor where nearly all of it could be a gradient.
     """
     here = Here(list(adopted), list(theta), "", left_in(survey, adopted))
     asked = {AVERAGING, NAME} & {a.name for a in adopted}
@@ -144,8 +144,8 @@ def those_here(
         return here  # what it lacks is told when the effects are taken off
     if AVERAGING in asked and averaged_otherwise(record, fitted, adopted, theta, survey.good):
         here = _without(here, AVERAGING, refuted=AVERAGING)
-    if NAME in asked and hidden_in_a_bent_field(record, fitted, here.adopted, here.theta, survey.good):
-        words = f"{NAME}: the field bends within the array, by more than it may be told from"
+    if NAME in asked and (why := hidden_objection(record, fitted, here.adopted, here.theta, survey.good)):
+        words = f"{NAME}: {why}"
         here = _without(here, NAME, left_in="; ".join(w for w in (here.left_in, words) if w))
     return here
 
