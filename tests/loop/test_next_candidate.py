@@ -12,7 +12,7 @@ from loop_cases import BASE, adopted_names, lasting_effects, linear_state, scena
 
 from magtensor.error_models.terms import Terms
 from magtensor.loop.fitting.model import Adopted, Fitting, Record, State
-from magtensor.loop.searching import by_hand, rivals, rounds
+from magtensor.loop.searching import by_hand, outcome, rivals, rounds
 from magtensor.loop.searching.course_of_time import BesideTime
 from magtensor.loop.searching.gates import ALPHA
 from magtensor.registry import Registry
@@ -163,3 +163,18 @@ def test_a_step_is_no_part_of_a_drift_unless_it_is(rises: Any, part: str) -> Non
     assert max(step.assessment.gain.total, drift.assessment.gain.total) > 100.0
     assert rivals.part_of_a_drift(step, found, state) == part
     assert not rivals.part_of_a_drift(drift, found, state)  # it lasts
+
+
+@pytest.mark.parametrize(("gain", "words"), [(90.0, "drift explained more"), (110.0, "drift is simpler")])
+def test_what_gives_way_is_told_whether_it_explained_less(
+    gain: float, words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def candidate(name: str, gain: float) -> Any:
+        figures = SimpleNamespace(gain=SimpleNamespace(total=gain, t=5.0))
+        passing = {"significant": True, "beyond_slow_noise": True, "passes": True, "alpha": 0.005}
+        refused = {"of_the_log": False, "of_second_order": False, "of_the_law": False, "log_noise": 0.0}
+        p = {"adjusted_p": 1e-9, "adjusted_own_p": 1e-9}
+        return SimpleNamespace(model=SimpleNamespace(name=name), assessment=figures, **passing, **refused, **p)
+
+    monkeypatch.setattr(outcome, "happens_once", lambda _: False)
+    assert outcome.why(candidate("tone", gain), candidate("drift", 100.0)).startswith(words)

@@ -174,5 +174,6 @@ def why(candidate: Candidate, winner: Candidate | None) -> str:
         return f"does not predict held-out blocks: {figures}"
     if winner is not None:
         ahead = winner.assessment.gain.total
-        return f"{winner.model.name} explained more (held-out gain {ahead:.4g}): {figures}"
+        how = "explained more" if ahead > gain.total else "is simpler and not told from it"
+        return f"{winner.model.name} {how} (held-out gain {ahead:.4g}): {figures}"
     return figures
