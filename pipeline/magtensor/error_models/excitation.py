@@ -21,7 +21,7 @@ from magtensor.error_models.held_logs import unheld
 from magtensor.error_models.station import Station
 from magtensor.errors import DataError, did_you_mean
 
-MOVING = 2.0  # times the noise, of a mean square; of a hundred runs noise makes 1.5 in one survey of a thousand
+MOVING = 2.0  # times the noise, of a mean square that a dozen values or more make up
 VECTORS = ("acceleration", "angular_rate")  # channels with a value for each axis whatever the number of sensors
 
 
@@ -311,17 +311,20 @@ class Excitation(Acting):
         return out
 
     def changes_within_runs(self, name: str) -> bool:
-        """Whether a channel changes from the first half of a run to the second by more than the noise that neighbouring
-        samples show."""
+        """Whether a channel changes within runs by more than the noise that neighbouring samples show: means of four
+        samples do, or of half a run that is shorter than eight."""
         series = self.logged[name].reshape(len(self.time), -1)
-        runs = [(a, b) for a, b in self.runs() if b - a >= 2]
+        runs = [series[a:b] for a, b in self.runs() if b - a >= 4]
         if not runs:
             return False
-        noise = np.mean(np.concatenate([np.diff(series[a:b], axis=0) for a, b in runs]) ** 2) / 2.0
-        middles = [(a, (a + b) // 2, b) for a, b in runs]
-        changes = [series[m:b].mean(axis=0) - series[a:m].mean(axis=0) for a, m, b in middles]
-        weights = [(m - a) * (b - m) / (b - a) for a, m, b in middles]
-        return bool(np.mean(np.square(changes) * np.array(weights)[:, None]) > MOVING * noise)
+        noise = np.mean(np.concatenate([np.diff(run, axis=0) for run in runs]) ** 2) / 2.0
+        square, freedom = 0.0, 0
+        for run in runs:
+            size = min(4, len(run) // 2)
+            means = run[: len(run) // size * size].reshape(-1, size, run.shape[1]).mean(axis=1)
+            square += size * float(np.sum((means - means.mean(axis=0)) ** 2))
+            freedom += (len(means) - 1) * run.shape[1]
+        return bool(square > MOVING * noise * freedom)
 
     def derivative(self, series: Array) -> Array:
         """d/dt of a series (N, ...), 1/s, within each run; zero where a run is a single sample."""
