@@ -14,7 +14,7 @@ from loop_cases import BASE, Array, adopted_names, linear_state, loaded, scenari
 from scipy.signal import StateSpace, lsim
 from scipy.spatial.transform import Rotation
 
-from magtensor.error_models.direction import turning_Hz, turning_line
+from magtensor.error_models.direction import turning_Hz, turning_lines
 from magtensor.loop.evidence.spectrum import spectral_lines
 from magtensor.loop.fitting.model import Adopted, Fitting
 from magtensor.loop.fitting.refit import joint_state
@@ -98,10 +98,10 @@ def test_where_the_turning_has_lines(tmp_path: Path) -> None:
     seen = Rotation.from_euler("Z", (2 * np.pi * 0.02 * time)[:, None]).inv().apply([1.0, 0.0, 0.0])
     field = np.repeat(5e4 * seen[:, None], len(record.sensors), axis=1)
     x = replace(record.excitation(field, field), attitude=None, logged={})
-    assert turning_line(x, 0.04) == pytest.approx(0.5, rel=0.02)  # of cos(a)^2, and of cos(a) sin(a)
-    assert turning_line(x, 0.033) < 1e-5
-    assert of_the_turning(x, 0.04, rms_nT=10.0)
-    assert not of_the_turning(x, 0.04, rms_nT=1000.0)  # a fiftieth of the field is no such law
+    line, none = turning_lines(x, [0.04, 0.033])
+    assert line == pytest.approx(0.5, rel=0.02)  # of cos(a)^2, and of cos(a) sin(a)
+    assert none < 1e-5
+    assert of_the_turning(x, [0.04, 0.04], [10.0, 1000.0]) == [True, False]  # a fiftieth of the field is no such law
 
 
 @pytest.mark.parametrize(("frequency", "doubted"), [(0.05, True), (0.9, False)])

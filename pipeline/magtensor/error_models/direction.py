@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from magtensor.attitude import into_platform
@@ -10,7 +12,7 @@ from magtensor.error_models.excitation import VECTORS, Excitation
 
 LINE = 20.0  # power over the median of what is beside it: one in ten thousand by chance, in the largest of a hundred
 WIDTH = 4  # frequencies, a survey's length apart, beyond which the window shows nothing of a line
-BESIDE = np.concatenate([-np.arange(WIDTH, 31), np.arange(WIDTH, 31)])  # such frequencies
+BESIDE = np.array([s * k for k in range(WIDTH, 31, 3) for s in (-1, 1)])  # such frequencies, the nearest first
 
 
 def direction_series(x: Excitation) -> Array:
@@ -50,24 +52,25 @@ def turning_Hz(x: Excitation) -> float:
     return float(np.sqrt(squares / (2.0 if len(axes) == 3 else 1.0)) / (2.0 * np.pi))  # three axes show a turn twice
 
 
-def turning_line(x: Excitation, frequency_Hz: float) -> float:
-    """The largest amplitude with which the attitude, in units of its own series, has a line at a frequency; 0 where
-    none of them has. Any law of the attitude has one there, with a memory or without."""
+def turning_lines(x: Excitation, frequencies_Hz: Sequence[float]) -> Array:
+    """(F,) the largest amplitude with which the attitude, in units of its own series, has a line at each frequency; 0
+    where none of them has. Any law of the attitude has one there, with a memory or without."""
+    if not len(frequencies_Hz):
+        return np.zeros(0)
     series = attitude_series(x)
     window = np.blackman(len(series) + 2)[1:-1]
     window /= window.sum()
-    series = series - window @ series
-
-    def amplitudes(frequencies: Array) -> Array:
-        turned = np.exp(-2j * np.pi * np.outer(frequencies, x.time - x.time[0]))
-        out: Array = 2.0 * np.abs((turned * window) @ series)
-        return out
-
-    here = amplitudes(np.array([frequency_Hz]))[0]
-    beside = amplitudes(frequency_Hz + BESIDE / max(x.duration, 1e-300))
-    next_to_it = beside[np.abs(BESIDE) == WIDTH].max(axis=0)  # larger on the skirts of another line
-    line = (here**2 > LINE * np.median(beside, axis=0) ** 2) & (here > next_to_it)
-    return float(np.max(here, initial=0.0, where=line))
+    series = (series - window @ series) * window[:, None]
+    step = 1.0 / max(x.duration, 1e-300)
+    out = np.zeros(len(frequencies_Hz))
+    for i, frequency in enumerate(frequencies_Hz):
+        asked = frequency + step * np.concatenate([[0.0], BESIDE])
+        turned = np.exp(-2j * np.pi * np.outer(asked, x.time - x.time[0]))
+        here, *beside = 2.0 * np.abs(turned @ series)
+        next_to_it = np.max(beside[:2], axis=0)  # larger on the skirts of another line
+        line = (here**2 > LINE * np.median(beside, axis=0) ** 2) & (here > next_to_it)
+        out[i] = np.max(here, initial=0.0, where=line)
+    return out
 
 
 def _unit(vectors: Array) -> Array:

@@ -7,10 +7,12 @@ is no evidence of a tone, unless it is larger than any such law would make it.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from magtensor.calibration.types import Array
-from magtensor.error_models.direction import turning_line
+from magtensor.error_models.direction import turning_lines
 from magtensor.error_models.excitation import Excitation
 from magtensor.loop.evidence.spectrum import spectral_lines
 from magtensor.loop.fitting.model import State
@@ -22,10 +24,12 @@ LARGEST_LAW = 0.01  # of the field, that a law of the attitude makes of an attit
 def tones(state: State, time: Array) -> tuple[float, ...]:
     """Hz of the strongest lines that are no more than likely the turning's, `time` being that of all samples."""
     lines = spectral_lines(state.residual, time[state.residual.samples], most=2 * MOST)
-    return tuple(f for f, rms, _ in lines if not of_the_turning(state.excitation, f, rms))[:MOST]
+    theirs = of_the_turning(state.excitation, [f for f, _, _ in lines], [rms for _, rms, _ in lines])
+    return tuple(f for (f, _, _), its in zip(lines, theirs, strict=True) if not its)[:MOST]
 
 
-def of_the_turning(x: Excitation, frequency_Hz: float, rms_nT: float) -> bool:
-    """Whether a law of the attitude may make a line of that rms."""
+def of_the_turning(x: Excitation, frequencies_Hz: Sequence[float], rms_nT: Sequence[float]) -> list[bool]:
+    """Whether a law of the attitude may make lines of that rms."""
     total = float(np.median(np.linalg.norm(x.field[:, 0], axis=1)))
-    return np.sqrt(2.0) * rms_nT < LARGEST_LAW * total * turning_line(x, frequency_Hz)
+    most = LARGEST_LAW * total * turning_lines(x, frequencies_Hz)
+    return [np.sqrt(2.0) * rms < largest for rms, largest in zip(rms_nT, most.tolist(), strict=True)]

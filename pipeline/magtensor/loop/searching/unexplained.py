@@ -55,7 +55,8 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
     line = strongest_line(state, record)
     # where the platform turns steadily, what is no tone has a small line too
     if line is not None and line[1] ** 2 >= OF_A_LINE * excess**2:
-        too = ", where the platform's turning has one too" if of_the_turning(state.excitation, *line) else ""
+        turning = of_the_turning(state.excitation, line[:1], line[1:])[0]
+        too = ", where the platform's turning has one too" if turning else ""
         words.append(f"a line at {line[0]:.4g} Hz (period {1 / line[0]:.4g} s), {line[1]:.3g} nT rms{too}")
     following = attitude_words(state)
     words.extend(following or converter_words(state))
