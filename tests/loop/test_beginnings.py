@@ -101,7 +101,8 @@ def test_evidence_stays_with_a_model_whose_form_has_moved(tmp_path: Path) -> Non
     assert adopted["evidence"]["z"] > 4
 
 
-@pytest.mark.parametrize("before", [(30e3, -20e3, -30e3), pytest.param(None, marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("before", [(30e3, -20e3, -30e3), None])
 def test_iron_that_stood_in_another_field_before_is_no_second_effect(
     before: tuple[float, float, float] | None, tmp_path: Path
 ) -> None:

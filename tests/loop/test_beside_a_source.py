@@ -48,6 +48,7 @@ def test_a_sensor_that_is_not_where_it_should_be(tmp_path: Path) -> None:
     assert before > 5.0 and after < 0.25  # noise of 0.15 nT an axis and 0.1 nT of the base station
 
 
+@pytest.mark.long
 def test_sensors_that_are_where_they_should_be(tmp_path: Path) -> None:
     told = verdict_of(tmp_path, beside_a_magnet(), models=MODELS)
     assert adopted_names(told) == {"fixed_source"}

@@ -60,11 +60,12 @@ def test_bad_samples_stay_and_spoil_no_others() -> None:
     assert found[70] == 1e5 and np.isnan(found[120])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("rate_Hz", "lags"),
     [
-        pytest.param(20.0, (0.0, 0.005, 0.010, 0.015), marks=pytest.mark.long),
-        pytest.param(10.0, (0.0, 0.02, 0.0, 0.0), marks=pytest.mark.long),
+        (20.0, (0.0, 0.005, 0.010, 0.015)),
+        (10.0, (0.0, 0.02, 0.0, 0.0)),
         (10.0, (0.0, 0.0, 0.1, 0.0)),
     ],
     ids=["read one after the other", "a fifth of a sample", "a sample"],

@@ -100,13 +100,12 @@ def telegraph(seed: int, time: Array, dwell_s: float) -> Array:
     return np.asarray(np.searchsorted(at, time) % 2, dtype=float)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("survey", "seed", "dwell_s", "size", "models", "words"),
     [
         (96, 6, 60.0, 0.6, ["offset_while", "turn_step"], "no lone event"),
-        pytest.param(
-            94, 5, 90.0, 1.0, ["offset_while", "offset_step"], "switches along one vector", marks=pytest.mark.long
-        ),
+        (94, 5, 90.0, 1.0, ["offset_while", "offset_step"], "switches along one vector"),
     ],
     ids=["one is found", "several are found"],
 )

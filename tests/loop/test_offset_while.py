@@ -24,7 +24,7 @@ def magnet(strength: float, sensors: int) -> list[dict[str, Any]]:
 @pytest.mark.parametrize(
     ("sensors", "strength"),
     [
-        (4, 0.3),
+        pytest.param(4, 0.3, marks=pytest.mark.long),
         pytest.param(4, 300.0, marks=pytest.mark.long),
         (1, 1.5),
         pytest.param(1, 3000.0, marks=pytest.mark.long),

@@ -82,9 +82,10 @@ def test_how_much_of_an_effect_follows_the_attitude(tmp_path: Path) -> None:
     assert attitude_share(state, [1]) < 0.1
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("seed", "named"),
-    [(60, {"latent_source"}), pytest.param(68, set(), marks=pytest.mark.long)],
+    [(60, {"latent_source"}), (68, set())],
     ids=["a step of it", "like the temperature by chance"],
 )
 def test_what_switches_a_few_times_is_no_step_and_nothing_that_passed(

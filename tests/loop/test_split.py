@@ -77,7 +77,8 @@ def test_two_time_constants_are_two_of_a_kind(seed: int, tmp_path: Path) -> None
     assert not told["unexplained"]["present"], told["unexplained"]["description"]
 
 
-@pytest.mark.parametrize("seed", [7, pytest.param(8, marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("seed", [7, 8])
 def test_one_time_constant_is_one(seed: int, tmp_path: Path) -> None:
     told = verdict_of(tmp_path, thermal(seed), warmed({120.0: 1.0}, rms_nT=4.0), THERMAL)
     assert [a["error_model"] for a in told["adopted"]] == ["temperature_offset"]
