@@ -81,6 +81,17 @@ def test_a_temperature_effect_is_none_the_less_one(seed: int, tmp_path: Path) ->
     assert adopted_names(told) == {"temperature_offset"}
 
 
+@pytest.mark.long
+def test_what_is_slow_in_the_reference_alone_is_no_course_of_the_sensors(tmp_path: Path) -> None:
+    effect = {"type": "temperature_scale", "rms_nT": 0.6}
+    settling = {"type": "reference_drift", "rms_nT": 1.5, "settles_s": 100.0}
+    motion = BASE["motion"] | {"duration_s": 600.0}
+    told = verdict_of(
+        tmp_path, scenario(33, effect, settling, motion=motion), None, ["temperature_scale", "scale_drift"]
+    )
+    assert adopted_names(told) == {"temperature_scale"}
+
+
 @pytest.mark.parametrize("law", ["root", "logarithm"])
 def test_a_law_of_time_goes_from_its_start_to_its_end(law: str) -> None:
     x = example_survey(Registry.load().find("error_model", "offset_drift"))
