@@ -89,7 +89,7 @@ def rivals_in_time(candidate: Candidate, possible: Sequence[Candidate], state: S
 
 
 def _followed(model: Adopted, x: Excitation) -> str:
-    """What a response follows: its channel, or the field if it lags that; "" for no response, and for one to several channels."""
+    """What a response follows: its one channel, or the field if it lags that; "" for what follows neither, or several."""
     channels = channels_of(model, x)
     if not channels:
         return "" if beginning(model.component, model.settings) is None else THE_FIELD
