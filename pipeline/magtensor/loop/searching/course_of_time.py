@@ -89,7 +89,7 @@ def rivals_in_time(candidate: Candidate, possible: Sequence[Candidate], state: S
 
 
 def _followed(model: Adopted, x: Excitation) -> str:
-    """What a response follows: its one channel, or the field if it lags that; "" for what follows neither, or several."""
+    """What a response follows: its one channel, or the field if it lags that; "" for neither, and for several."""
     channels = channels_of(model, x)
     if not channels:
         return "" if beginning(model.component, model.settings) is None else THE_FIELD
