@@ -15,8 +15,12 @@ Surveys with several effects have them from different families, so that none is 
 
 The **oracle** tests the right effect alone, once, with the right settings, in noise whose colour it knows from the same
 survey without the effect, at the loop's level of one in 200. The loop has it harder: it tries some thirty models
-with all their settings and wants held-out gains. The oracle of a source that nobody logged would have to know the
-waveform; there is none. Intervals are exact ones of Clopper and Pearson, 95 %.
+with all their settings, and has to ask more of each of these tests to accuse one clean survey in 200 of anything. So
+there is a second figure, **oracle that pays**: the same test at that level over the number of models times the
+number of tests that the settings of the right one amount to. What is lost between the two is the price of not knowing
+what to look for; no search with that false-alarm rate could have it. What the loop loses beside the second is its own:
+the colour of the noise, which it does not know, and the held-out gain that it wants. The oracle of a source that nobody
+logged would have to know the waveform; there is none. Intervals are exact ones of Clopper and Pearson, 95 %.
 
 Surveys of one sample a second are quicker, but the turning with tilts is then too fast for the rates that the effects
 of turning need: these are told as not tested.
@@ -51,7 +55,10 @@ from magtensor.loop.evidence.turned import TurnedColour
 from magtensor.loop.fitting.model import Fitting, Record, State
 from magtensor.loop.fitting.refit import joint_state
 from magtensor.loop.searching.found import Search
+from magtensor.loop.searching.gates import ALPHA
 from magtensor.loop.searching.outcome import why
+from magtensor.loop.searching.profiling import SCREENING_SAMPLES, Thinned, best_settings
+from magtensor.loop.searching.rounds import testable
 from magtensor.loop.searching.search import search
 from magtensor.loop.searching.unexplained import unexplained
 from magtensor.registry import Registry
@@ -148,6 +155,14 @@ def oracle(trial: Trial, simulation: Simulated, record: Record, state: State) ->
     return float(chi2.sf(explained(estimate), estimate.rank)) if estimate.rank else 1.0
 
 
+def tests(trial: Trial, state: State) -> float:
+    """How many tests the loop corrects the p value of the effect for: those of its settings, times the models tried."""
+    every = testable(state.excitation, list(models().values()))
+    few = Thinned.of(state, SCREENING_SAMPLES)
+    found = best_settings(models()[trial.effect], state, few, {}, ALPHA / len(every))
+    return len(every) * (found[0][1] if found else 1.0)
+
+
 def lost(found: Search, effect: str) -> str:
     """Where the search lost an effect that it did not adopt."""
     words = []
@@ -190,6 +205,8 @@ def tried(trial: Trial) -> dict[str, Any]:
         record = recorded(simulation)
         state = joint_state(record, [], Fitting())
         row["oracle"] = oracle(trial, simulation, record, state)
+        if row["oracle"] is not None:
+            row["tests"] = tests(trial, state)
         found = search(record, list(models().values()), Fitting())
     except MagtensorError as error:
         return row | {"outcome": "cannot be", "why": str(error).splitlines()[0]}

@@ -41,6 +41,11 @@ def seen(row: Row) -> bool:
     return row["oracle"] is not None and row["oracle"] < ORACLE_LEVEL
 
 
+def affordable(row: Row) -> bool:
+    """Whether the oracle finds the effect where it pays for all that the loop tries."""
+    return row["oracle"] is not None and row["oracle"] * row.get("tests", 1.0) < ORACLE_LEVEL
+
+
 def by_rival(row: Row) -> bool:
     """Whether the effect was adopted under the name of a model that it is declared indistinguishable from."""
     return row["outcome"] == "right" and row["effect"] not in row["adopted"]
@@ -94,19 +99,27 @@ def power(rows: Sequence[Row]) -> Iterator[str]:
     for (motion, noise, amplitude), own in sorted(groups(rows, "motion", "noise", "amplitude"), key=lambda g: g[0][2]):
         known = [r for r in own if r["oracle"] is not None]
         found = [r for r in own if seen(r)]
-        named = sum(r["outcome"] in ("right", "more") for r in found)
-        cells = [f"{amplitude:g} x noise", motion, noise, share(len(found), len(known)), share(named, len(found))]
+        paid = [r for r in own if affordable(r)]
+        cells = [f"{amplitude:g} x noise", motion, noise, share(len(found), len(known)), named_of(found)]
+        cells += [share(len(paid), len(known)), named_of(paid)]
         lines.append(cells + [among(o)(own) for o in ("right", "more", "wrong")])
         lines[-1] += [str(sum(r["outcome"] == o for r in own)) for o in ("told", "missed")]
         lines[-1].append(str(sum(by_rival(r) for r in own)))
-    header = ["amplitude", "motion", "noise", "oracle finds it", "of these the loop names", "right", "more", "wrong"]
+    header = ["amplitude", "motion", "noise", "oracle finds it", "of these the loop names"]
+    header += ["oracle that pays finds it", "of these the loop names", "right", "more", "wrong"]
     yield from table([*header, "told", "missed", "right, but adopted as a rival"], lines)
+
+
+def named_of(rows: Sequence[Row]) -> str:
+    """The share of them that the loop names."""
+    return share(sum(r["outcome"] in ("right", "more") for r in rows), len(rows))
 
 
 def outcome(row: Row) -> str:
     """One cell."""
     rival = f" ({', '.join(row['adopted'])})" if by_rival(row) or row["outcome"] == "wrong" else ""
-    return f"{row['outcome']}{rival}{'*' if row['oracle'] is not None and not seen(row) else ''}"
+    mark = "" if row["oracle"] is None or affordable(row) else "+" if seen(row) else "*"
+    return f"{row['outcome']}{rival}{mark}"
 
 
 def by_effect(rows: Sequence[Row]) -> Iterator[str]:
@@ -115,7 +128,8 @@ def by_effect(rows: Sequence[Row]) -> Iterator[str]:
     yield ""
     yield (
         "In brackets: what was adopted, where it is not the effect itself. An asterisk: the oracle does not find it "
-        "either. A dash: not run, or no such survey can be simulated (delays of a minute to be as large as asked)."
+        "either; a plus: not the one that pays for what was tried. A dash: not run, or no such survey can be simulated "
+        "(delays of a minute to be as large as asked)."
     )
     yield ""
     columns = sorted({(r["motion"], r["noise"], r["amplitude"]) for r in rows}, key=lambda c: (c[1], c[0], c[2]))
