@@ -21,6 +21,7 @@ _COLUMNS = 16  # filtered at a time
 _SHORT = np.array([1.0, 3.0, 10.0])  # time constants in samples
 _LEAST = 64  # samples, of fewer the noise is taken for white
 _LEAST_OF_SHORT = 100  # of them in a survey, or it is not short
+_LEAST_LEFT = 1e-3  # frequencies' worth of noise, where a series was taken off them
 _SETTLING = 3  # rounds in which a colour and what goes with the field settle
 
 
@@ -66,7 +67,9 @@ class Colour:
         return out.reshape(series.shape)
 
 
-def colour_of(series: Array, freedom: float | None = None, *, stiff: bool = False, above: int = 1) -> Colour:
+def colour_of(
+    series: Array, freedom: float | None = None, *, stiff: bool = False, above: int = 1, left: Array | None = None
+) -> Colour:
     """Fit white noise plus slow processes to the mean spectrum of the columns of (N, K).
 
     Parameters
@@ -77,6 +80,8 @@ def colour_of(series: Array, freedom: float | None = None, *, stiff: bool = Fals
         middle ones. What a regressor took away there, having followed the noise, is then not missed.
     above: number of the lowest cosine frequency that counts, where many regressors left nothing below; from what is
         left white noise and 1/f are known, and no steeper law.
+    left: (N,) part of the noise at each cosine frequency that the series hold, where something was taken off; all where
+        not given.
     """
     from scipy.optimize import nnls
 
@@ -89,9 +94,10 @@ def colour_of(series: Array, freedom: float | None = None, *, stiff: bool = Fals
     frequency = np.arange(1, n) / (2.0 * n)  # cycles per sample
     edges = np.unique(np.round(np.geomspace(1, n, min(60, n // 4))).astype(int))
     edges = edges[edges >= min(above, n // 2)]
-    level = np.add.reduceat(power, edges[:-1] - 1) / np.diff(edges)
+    held = np.diff(edges) * 1.0 if left is None else np.maximum(np.add.reduceat(left[1:], edges[:-1] - 1), _LEAST_LEFT)
+    level = np.add.reduceat(power, edges[:-1] - 1) / held
     centre = (edges[:-1] + edges[1:] - 1) / (4.0 * n)
-    count = np.diff(edges) * k * share
+    count = held * k * share
     shapes_of = (_laws if above == 1 else _flicker) if stiff else _relaxations
     shapes = shapes_of(centre, n)
     # chi-square weights from the fitted level itself: two rounds settle them, or go in circles where a trend stands far

@@ -10,27 +10,31 @@ field; what it does in both is added up before it is squared.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
 from magtensor.calibration.types import Array
 from magtensor.error_models.terms import REFERENCE, Terms, joined
 from magtensor.loop.evidence.columns import across_directions, along_the_field
-from magtensor.loop.evidence.one_coefficient import one_coefficient_p
+from magtensor.loop.evidence.one_series import one_series_p
 from magtensor.loop.evidence.residual import Residual
-from magtensor.loop.evidence.statistics import Own, identifiable
+from magtensor.loop.evidence.sensor_noise import (
+    LEAST,
+    OCTAVE,
+    SensorNoise,
+    bands,
+    grams_in_bands,
+    inverse_of,
+    over_frequency,
+    smoothed_spectrum,
+)
+from magtensor.loop.evidence.statistics import Own, cauchy_combination, fisher_combination, identifiable
 
-LEAST = 64  # samples, of fewer the noise is taken for white
-OCTAVE = 4  # frequencies in the lowest one
-BAND = 8  # frequencies in the lowest band in which sensors are compared
 MOST_MISSING = 0.25  # of the samples: longer gaps are shortened to that
-ALIKE = 4.0  # values that the axes of one sensor are taken to be alike by
-_SMOOTHING = 8  # rounds in which a course between the middles of octaves gets their levels
-_SCORING = 30  # rounds in which the levels of the sensors are found
 _INNER_RANK = 1e-6  # of the largest singular value
 _LEAST_REFERENCE = 0.1  # of the power along the field, which is not the sensors'
 
@@ -50,17 +54,28 @@ class OwnNoise:
     def p_value(self, terms: Terms) -> float:
         """Probability that noise explains as much as terms, at the residual's samples, do beside the given ones.
 
+        Of one coefficient of the reference, and of one series that is added to outputs of the sensors, the exact law is
+        known (`one_series`). Of the sensors it is asked in what differs between them: of each beside all others, which
+        shows what one of them does, and of each beside those that are quieter, which is independent of each other and
+        put together (Fisher 1925).
+        """
+        if terms.count == 1 and np.all(terms.part_output == REFERENCE) and self.residual.sighted is None:
+            return self._of_one_in_the_reference(terms)
+        if self.residual.across is None or not _one_series(terms):
+            return self._by_score(terms)
+        return cauchy_combination([self._by_score(terms), *self._of_one_series(terms)])
+
+    def _by_score(self, terms: Terms) -> float:
+        """The same of any terms, by the score of their coefficients.
+
         The levels of the noise are those of all that is left, what the terms explain included, and known from few
         frequencies where they are slow. In one band what is explained is then a share of as many values as the level is
         known from (Satterthwaite 1946): beta-distributed, like the squared multiple correlation. Where bands of
         few and of many values come together that share has no bound of one, and would be far too unlikely; chi-square,
-        as if the levels were known, errs to the other side in one band. The larger of both is taken. Of one coefficient
-        of the reference the exact law is known (`one_coefficient`).
+        as if the levels were known, errs to the other side in one band. The larger of both is taken.
         """
         from scipy.special import betaincc, chdtrc
 
-        if terms.count == 1 and np.all(terms.part_output == REFERENCE) and self.residual.sighted is None:
-            return self._of_one_in_the_reference(terms)
         every = terms if self.given is None else joined([self.given, terms])
         across, along = self._across_of(every), self._along_of(every)
         size = every.count if across is None else across.into.shape[1]
@@ -76,7 +91,7 @@ class OwnNoise:
         others = np.setdiff1d(np.arange(size), tested)
         seen = np.zeros((len(tested), size))
         seen[:, tested] = np.eye(len(tested))
-        seen[:, others] = -normal[np.ix_(tested, others)] @ _inverse(normal[np.ix_(others, others)])
+        seen[:, others] = -normal[np.ix_(tested, others)] @ inverse_of(normal[np.ix_(others, others)])
         seen = identifiable(seen @ normal @ seen.T, Own(alone[tested], terms.noise_of_each)).T @ seen
         rank = len(seen)
         if not rank:
@@ -96,29 +111,73 @@ class OwnNoise:
         """The same of a single coefficient that is seen in |b| - F alone, octave by octave."""
         if self.residual.along is None:
             return 1.0
-        count = len(self._along)
         every = terms if self.given is None else joined([terms, self.given])
-        series = _frequencies(self._even(along_the_field(self.residual, [every]).made)) / self._root_along[:, None]
+        series = over_frequency(self._even(along_the_field(self.residual, [every]).made)) / self._root_along[:, None]
         column, others = series[:, 0], series[:, 1:]
         free = self._free_along
         more, size, _ = np.linalg.svd(others - free @ (free.T @ others), full_matrices=False)
         taken = np.column_stack([free, more[:, size > _INNER_RANK * max(size.max(initial=0.0), 1.0)]])
         column, values = (each - taken @ (taken.T @ each) for each in (column, self._values_along))
-        octaves = 1 + OCTAVE * 2 ** np.arange(max(int(np.log2(count)), 1))
-        edges = np.concatenate([[1], octaves[octaves < count // 2], [count]])
+        return _in_octaves(column, values[:, None], taken)
 
-        def sums(each: Array) -> Array:
-            return np.add.reduceat(each, edges[:-1])
+    def _of_one_series(self, terms: Terms) -> tuple[float, float]:
+        """The same of a series that is added to outputs of sensors, by what differs between these: that any of them
+        shows it beside the others, and that all do."""
+        given = [] if self.given is None else [self.given.series]
+        series = over_frequency(self._even(np.hstack([terms.series, self.residual.affine, *given])))
+        series[0] = 0.0
+        noise = self._sensors.without(series)
+        narrow = noise.narrow()
+        sensors, own = noise.from_quiet_to_noisy(), {int(s) for s in terms.part_output // 3}
+        order = [s for s in sensors if s not in own] + [s for s in sensors if s in own]
 
-        left = np.diff(edges) - sums(np.sum(taken**2, axis=1))
-        return one_coefficient_p(left, sums(column * values), sums(column**2), sums(values**2))
+        def beside(sensor: int, others: Sequence[int]) -> float:
+            return self._of_one_sensor(terms, series, narrow, [sensor, *others])
+
+        each = [beside(s, [o for o in order if o != s]) for s in sorted(own)]
+        quieter = [beside(s, order[:k]) for k, s in enumerate(order) if s in own and k]
+        return cauchy_combination(each), fisher_combination(quieter)
+
+    def _of_one_sensor(
+        self, terms: Terms, series: Array, narrow: Sequence[tuple[slice, Array]], sensors: Sequence[int]
+    ) -> float:
+        """The same of the first of some sensors, by what differs between it and the others.
+
+        Parameters
+        ----------
+        series: (N, 1 + Q) over frequency, that of the terms and others that are free; narrow: bands with the power of
+            the outputs in each.
+        """
+        outputs = np.concatenate([np.arange(3 * s, 3 * s + 3) for s in sensors])
+        own = terms.part_output // 3 == sensors[0]
+        into = np.zeros((terms.count, len(outputs)))
+        axis = terms.part_output[own] % 3
+        np.add.at(into, (terms.part_term[own], axis), terms.part_weight[own] / self.residual.noise[outputs[axis]])
+        into = into[np.any(into != 0.0, axis=1)]
+        series, seen = series.copy(), np.empty((len(series), len(into)))
+        plane = self.residual.basis[outputs]
+        for band, power in narrow:
+            weight = np.diag(1.0 / power[outputs])
+            weight -= weight @ plane @ np.linalg.solve(plane.T @ weight @ plane, plane.T @ weight)
+            level, axes = np.linalg.eigh(into @ weight @ into.T)
+            alike = (
+                weight @ into.T @ axes / np.sqrt(level) @ axes.T
+            )  # to directions in which noise is one, alike in all
+            seen[band] = self._sensors.values[band][:, outputs] @ alike
+            series[band] *= np.exp(0.5 * np.mean(np.log(level)))
+        basis, size, _ = np.linalg.svd(series[:, 1:], full_matrices=False)
+        taken = basis[:, size > _INNER_RANK * size.max(initial=0.0)]
+        column, seen = (each - taken @ (taken.T @ each) for each in (series[:, 0], seen))
+        if np.sum(column**2) <= _INNER_RANK**2 * np.sum(series[:, 0] ** 2):
+            return 1.0
+        return _in_octaves(column, seen, taken)
 
     def slow_std(self) -> Array:
         """(3 S,) nT, rms of the slow noise of each output beside its white noise; 0 of a single sensor."""
         if self.residual.across is None:
             return np.zeros(len(self.residual.noise))
-        each = np.diff(self._edges)
-        power = np.repeat(self._levels, each, axis=0) * self._root_across[:, None] ** 2
+        each = np.diff(self._sensors.edges)
+        power = np.repeat(self._sensors.levels, each, axis=0) * self._sensors.root[:, None] ** 2
         out: Array = np.sqrt(np.maximum(np.mean(power - power[-1], axis=0), 0.0)) * self.residual.noise
         return out
 
@@ -142,7 +201,7 @@ class OwnNoise:
         for a in range(own):
             first = terms.count + a * size
             into[count + a, first : first + size] = np.eye(size)
-        series = _frequencies(self._even(np.hstack([terms.series, residual.affine]))) / self._root_across[:, None]
+        series = over_frequency(self._even(np.hstack([terms.series, residual.affine]))) / self._sensors.root[:, None]
         series[0] = 0.0
         return _Across(series, into)
 
@@ -150,7 +209,7 @@ class OwnNoise:
         """The columns of terms along the field, whitened, what C and o can do taken off."""
         residual, rows = self.residual, []
         if residual.along is not None:
-            rows.append(_frequencies(self._even(along_the_field(residual, [terms]).made)) / self._root_along[:, None])
+            rows.append(over_frequency(self._even(along_the_field(residual, [terms]).made)) / self._root_along[:, None])
         if residual.sighted is not None:
             rows.append(across_directions(residual, [terms]).made)
         if not rows:
@@ -161,8 +220,8 @@ class OwnNoise:
 
     def _add_across(self, across: _Across, score: Array, normal: Array) -> None:
         """Add what the values across say of the coefficients, weighted by the noise of each sensor in each band."""
-        values = self._across / self._root_across[:, None]
-        for (i, j), weight in zip(pairwise(self._edges), self._weights, strict=True):
+        values = self._sensors.values / self._sensors.root[:, None]
+        for (i, j), weight in zip(pairwise(self._sensors.edges), self._sensors.weights, strict=True):
             weighted, series = across.into @ weight, across.series[i:j]
             score += np.einsum("sko,so->k", weighted, series.T @ values[i:j])
             normal += np.einsum("sko,st,tlo->kl", weighted, series.T @ series, across.into, optimize=True)
@@ -174,13 +233,13 @@ class OwnNoise:
         ----------
         seen: (R, P or more) the scores, as sums of those of the terms, of which the first are `count`.
         """
-        residual, edges = self.residual, self._edges
+        residual, edges = self.residual, bands(len(self._even(self.residual.affine)))
         n, sensors, each = edges[-1], len(residual.noise) // 3, np.diff(edges).astype(float)
         parts, counts, turned = [], [], None
         rows = None if along is None else along.rows @ seen[:, :count].T
         if rows is not None and residual.along is not None:
             turned = _course(rows[:n] / self._root_along[:, None])
-            parts.append(_grams(rows[:n] * np.sqrt(self._reference / self._root_along**2)[:, None], edges))
+            parts.append(grams_in_bands(rows[:n] * np.sqrt(self._reference / self._root_along**2)[:, None], edges))
             counts.append(each)
         if rows is not None and residual.sighted is not None:
             sighted = rows[-len(residual.sighted.residual) :]
@@ -190,13 +249,13 @@ class OwnNoise:
             of_output = np.zeros((3 * sensors, n, len(seen)))
             if turned is not None:
                 for o, gain in enumerate(self._even(residual.gain).T):
-                    of_output[o] += _frequencies(turned * gain[:, None]) * self._root_across[:, None]
+                    of_output[o] += over_frequency(turned * gain[:, None]) * self._sensors.root[:, None]
             if across is not None:
-                for (i, j), weight in zip(pairwise(edges), self._weights, strict=True):
+                for (i, j), weight in zip(pairwise(edges), self._sensors.weights, strict=True):
                     through = np.einsum("rk,sko->osr", seen, across.into @ weight, optimize=True)
                     of_output[:, i:j] += across.series[i:j] @ through
-            for own, levels in zip(of_output, self._levels.T, strict=True):
-                parts.append(_grams(own, edges) * levels[:, None, None])
+            for own, levels in zip(of_output, self._sensors.levels.T, strict=True):
+                parts.append(grams_in_bands(own, edges) * levels[:, None, None])
                 counts.append(each * (sensors - 1) / sensors)
         return np.concatenate(parts), np.concatenate(counts)
 
@@ -227,43 +286,18 @@ class OwnNoise:
         return out
 
     @cached_property
-    def _edges(self) -> NDArray[np.int_]:
-        """(B + 1,) frequencies between which the noise of the sensors is compared."""
-        n = len(self._even(self.residual.affine))
-        octaves = BAND * 2 ** np.arange(max(int(np.log2(n)), 1))
-        return np.concatenate([[0], octaves[octaves < n // 2], [n]])
-
-    @cached_property
-    def _across(self) -> Array:
-        """(N, 3 S) the residual across, over frequency, without its mean."""
+    def _sensors(self) -> SensorNoise:
+        """Of the residual across."""
         assert self.residual.across is not None
-        out = _frequencies(self._even(self.residual.across))
-        out[0] = 0.0
-        return out
-
-    @cached_property
-    def _root_across(self) -> Array:
-        """(N,) root of its mean power, smoothed."""
-        values = len(self.residual.noise) - 3
-        return np.sqrt(smoothed_spectrum(np.sum(self._across**2, axis=1) / values))
-
-    @cached_property
-    def _levels(self) -> Array:
-        """(B, 3 S) power of each output's noise over that of all, in each band."""
-        each = _grams(self._across / self._root_across[:, None], self._edges)
-        return _levels(each, np.diff(self._edges), self.residual.projector)
-
-    @cached_property
-    def _weights(self) -> Array:
-        """(B, 3 S, 3 S) inverse covariance across of the sensors' noise in each band."""
-        projector = self.residual.projector
-        return _inverse(projector * self._levels[:, None] @ projector, 1e-9)
+        values = over_frequency(self._even(self.residual.across))
+        values[0] = 0.0
+        return SensorNoise.of(values, self.residual.projector)
 
     @cached_property
     def _along(self) -> Array:
         """(N,) the residual along, over frequency."""
         assert self.residual.along is not None
-        return _frequencies(self._even(self.residual.along))
+        return over_frequency(self._even(self.residual.along))
 
     @cached_property
     def _root_along(self) -> Array:
@@ -285,7 +319,7 @@ class OwnNoise:
         """(N or more, Q) orthonormal: what C and o can explain of these."""
         residual, rows = self.residual, []
         if residual.along is not None:
-            rows.append(_frequencies(self._even(residual.inner)) / self._root_along[:, None])
+            rows.append(over_frequency(self._even(residual.inner)) / self._root_along[:, None])
         if residual.sighted is not None:
             rows.append(residual.sighted.inner)
         basis, size, _ = np.linalg.svd(np.concatenate(rows), full_matrices=False)
@@ -299,7 +333,7 @@ class OwnNoise:
         if self.residual.across is None:
             return power
         shown = np.mean(self.residual.gain**2, axis=0)
-        white = float(shown @ self._levels[-1]) * float(self._root_across[-1] ** 2)
+        white = float(shown @ self._sensors.levels[-1]) * float(self._sensors.root[-1] ** 2)
         return np.maximum(power - white, _LEAST_REFERENCE * power)
 
 
@@ -319,75 +353,30 @@ class _Along:
     alone: Array
 
 
-def smoothed_spectrum(power: Array) -> Array:
-    """Power (N,) over the cosine frequencies, smoothed over octaves; below the middle of the lowest it rises as it does
-    above."""
-    n = len(power)
-    if n < LEAST:
-        return np.full(n, max(float(np.mean(power[1:])), 1e-300))
-    octaves = OCTAVE * 2 ** np.arange(int(np.log2(n)))
-    edges = np.concatenate([[1], octaves[octaves < n // 2], [n]])
-    place = np.log(np.arange(1, n))
-
-    def means(values: Array) -> Array:
-        return np.add.reduceat(values, edges[:-1] - 1) / np.diff(edges)
-
-    level, middle = means(np.maximum(power[1:], 1e-300)), means(place)
-
-    def between(course: Array) -> Array:
-        values = np.interp(place, middle, course)
-        slope = min((course[1] - course[0]) / (middle[1] - middle[0]), 0.0)
-        return np.exp(values + slope * np.minimum(place - middle[0], 0.0))
-
-    course = np.log(level)
-    for _ in range(_SMOOTHING):
-        course += np.log(level / means(between(course)))
-    smooth = between(course)
-    return np.concatenate([smooth[:1], smooth])
+def _one_series(terms: Terms) -> bool:
+    """Whether all coefficients add the same series to outputs, each to those of one sensor."""
+    of_one = all(len(set(terms.part_output[terms.part_term == p] // 3)) == 1 for p in range(terms.count))
+    return (
+        of_one and terms.series.shape[1] == 1 and terms.delay is None and bool(np.all(terms.part_output != REFERENCE))
+    )
 
 
-def _levels(squares: Array, counts: NDArray[np.int_], projector: Array) -> Array:
-    """(B, 3 S), the likeliest power of each output's noise in whitened values across.
-
-    First of each sensor, then of each of its axes, held to that of the sensor as by some values more of the same power.
-    Two sensors have one contrast, which does not tell whose noise it is.
+def _in_octaves(column: Array, values: Array, taken: Array) -> float:
+    """P value of a column (N,) in values (N, D) of white noise over frequency, whose level is known from themselves.
 
     Parameters
     ----------
-    squares: (B, 3 S, 3 S) products of the values of each band; counts: (B,) how many it has.
+    taken: (N, Q) orthonormal, what has been projected off all of these.
     """
-    outputs, sensors = len(projector), len(projector) // 3
-    covariance = squares / counts[:, None, None]
-    if sensors < 3:
-        mean = np.trace(covariance, axis1=1, axis2=2) / (outputs - 3)
-        return np.repeat(mean[:, None], outputs, axis=1)
-    of_sensors = _scored(covariance, projector, np.ones((len(counts), outputs)), 3, np.ones(len(counts)))
-    values = counts * (sensors - 1) / sensors
-    return _scored(covariance, projector, of_sensors, 1, values / (values + ALIKE))
+    count, dimension = values.shape
+    octaves = OCTAVE * 2 ** np.arange(max(int(np.log2(count)), 1))
+    edges = np.concatenate([[1], octaves[octaves < count // 2], [count]])
 
+    def sums(each: Array) -> Array:
+        return np.add.reduceat(each, edges[:-1])
 
-def _scored(covariance: Array, projector: Array, levels: Array, alike: int, weight: Array) -> Array:
-    """Levels (B, 3 S), those of so many neighbours alike, by steps of scoring on the logarithms from those given, which
-    count for the rest of the weight (B,); halved, the steps keep the levels positive and raise the likelihood."""
-    first, weight = levels, weight[:, None]
-
-    def of_neighbours(matrices: Array) -> Array:
-        each = np.diagonal(matrices, axis1=1, axis2=2).reshape(len(levels), -1, alike)
-        return np.repeat(each.sum(axis=2), alike, axis=1)
-
-    for _ in range(_SCORING):
-        inverse = _inverse(projector * levels[:, None] @ projector, 1e-9)
-        seen, expected = of_neighbours(inverse @ covariance @ inverse), of_neighbours(inverse)
-        likeliest = levels * np.sqrt(np.maximum(seen, 1e-12 * expected) / expected)
-        levels = weight * likeliest + (1.0 - weight) * first
-    return levels
-
-
-def _frequencies(series: Array) -> Array:
-    from scipy.fft import dct
-
-    out: Array = dct(series, axis=0, norm="ortho")
-    return out
+    left = dimension * (np.diff(edges) - sums(np.sum(taken**2, axis=1)))
+    return one_series_p(left, sums(column[:, None] * values), sums(column**2), sums(np.sum(values**2, axis=1)))
 
 
 def _course(spectrum: Array) -> Array:
@@ -395,12 +384,3 @@ def _course(spectrum: Array) -> Array:
 
     out: Array = idct(spectrum, axis=0, norm="ortho")
     return out
-
-
-def _inverse(matrix: Array, least: float = 1e-10) -> Array:
-    return np.asarray(np.linalg.pinv(matrix, rcond=least, hermitian=True), dtype=float)
-
-
-def _grams(columns: Array, edges: NDArray[np.int_]) -> Array:
-    """(B, P, P) products of the columns of (N, P) in each band."""
-    return np.stack([columns[i:j].T @ columns[i:j] for i, j in pairwise(edges)])

@@ -274,12 +274,24 @@ def _without_others(
 
 def cauchy_combination(p_values: Sequence[float]) -> float:
     """One p value from several that may depend on each other (ACAT, Liu and Xie 2020)."""
+    if min(p_values) >= 1.0:
+        return 1.0
     p = np.clip(np.asarray(p_values, dtype=float), 1e-300, 1 - 1e-12)
     # tan(pi (1/2 - p)) is 1 / (pi p) for the smallest p, where the tangent itself overflows its accuracy
     statistic = np.mean(np.where(p < 1e-15, 1 / (np.pi * p), np.tan(np.pi * (0.5 - p))))
     if statistic > 1e15:
         return float(1 / (np.pi * statistic))
     return float(0.5 - np.arctan(statistic) / np.pi)
+
+
+def fisher_combination(p_values: Sequence[float]) -> float:
+    """One p value from several independent ones (Fisher 1925); 1 of none."""
+    from scipy.special import chdtrc
+
+    if not len(p_values):
+        return 1.0
+    p = np.maximum(np.asarray(p_values, dtype=float), 1e-300)
+    return float(chdtrc(2.0 * len(p), -2.0 * np.sum(np.log(p))))
 
 
 @dataclass(frozen=True)

@@ -94,20 +94,33 @@ class Candidate:
         """
         if self.adjusted_p < self.alpha:
             return True
-        if happens_once(self.model) or a_tone(self.model):
+        if not self._of_a_known_spectrum:
             return False
         by_blocks = self.assessment.p * self.tried if adds_to_axes(self.terms) else self.adjusted_p
         return self.adjusted_own_p < self.alpha and by_blocks < BORNE_OUT
 
     @property
+    def _of_a_known_spectrum(self) -> bool:
+        """Whether noise of each sensor's own spectrum is a test of it by itself: not of what was sought where that
+        noise is strongest, or of an event, whose time was."""
+        return not happens_once(self.model) and not a_tone(self.model)
+
+    @property
+    def beyond_own_noise(self) -> bool:
+        """Whether it is added to the axes and noise of each sensor's own spectrum does not explain it."""
+        return self._of_a_known_spectrum and adds_to_axes(self.terms) and self.adjusted_own_p < self.alpha
+
+    @property
     def beyond_slow_noise(self) -> bool:
         """Whether noise of the colour that the residual has without the model, all of it taken for noise, does not
-        explain what the model does: it predicts held-out blocks even so, or that much would be too unlikely.
+        explain what the model does: it predicts held-out blocks even so, or that much would be too unlikely, in noise
+        of that colour or of each sensor's own spectrum.
 
         What happens once, at the beginning or end, is seen by few blocks, and the others cannot predict it closely
         enough in noise so strong.
         """
-        return self.assessment.null_gain.total > 0 or self.adjusted_null_p < self.alpha
+        unlikely = self.adjusted_null_p < self.alpha or self.beyond_own_noise
+        return self.assessment.null_gain.total > 0 or unlikely
 
     @property
     def predicts(self) -> bool:
@@ -123,18 +136,20 @@ class Candidate:
         """Whether a model that acts in a part of the survey only predicts one part of that from the others.
 
         Then the folds of equal length are but one or two figures, which may gain much and tell no scatter. The short
-        folds in which it acts are not asked unless its p value and that in noise of the residual's own colour pass, and
-        in noise of that colour it has to predict them as well. Only of what happens once or follows a channel: a
-        drift is everywhere, and short folds at its end say no more than that neighbours are alike.
+        folds in which it acts are not asked unless noise as slow and as strong as the residual's own does not explain
+        it, and in noise of the residual's own colour it has to predict them as well. By its p value and that in noise
+        of that colour this is known of what happens once or follows a channel: a drift is everywhere, and short folds
+        at its end say no more than that neighbours are alike. In noise of each sensor's own spectrum it is known of a
+        drift too.
         """
-        channel = any(isinstance(grid, AnyChannel) for grid in profiled(self.model.component).values())
-        if not channel and not happens_once(self.model):
-            return False
         focused, null = self.assessment.focused, self.assessment.null_focused
         if focused is None or null is None or self.assessment.gain.total <= 0:
             return False
+        channel = any(isinstance(grid, AnyChannel) for grid in profiled(self.model.component).values())
         unlikely = self.adjusted_p < self.alpha and self.adjusted_null_p < self.alpha
-        return unlikely and focused.consistent and null.total > 0
+        if not (unlikely and (channel or happens_once(self.model))) and not self.beyond_own_noise:
+            return False
+        return focused.consistent and null.total > 0
 
     @property
     def passes(self) -> bool:

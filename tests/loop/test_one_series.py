@@ -1,4 +1,4 @@
-"""One coefficient in noise whose power is known from the residual alone, octave by octave."""
+"""Coefficients of one series in noise whose power is known from the residual alone, octave by octave."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 from loop_cases import BASE, Array, linear_state, loaded, scenario
 from scipy.special import betaincc
 
-from magtensor.loop.evidence.one_coefficient import one_coefficient_p
+from magtensor.loop.evidence.one_series import one_series_p
 from magtensor.loop.evidence.own_noise import OwnNoise
 from magtensor.registry import Registry
 
@@ -17,21 +17,28 @@ COUNTS = np.array([4.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0, 256.0])
 SQUARES = np.array([160.0, 120.0, 100.0, 60.0, 40.0, 20.0, 10.0, 5.0])  # of a regressor that is slow, as a step is
 
 
-@pytest.mark.parametrize(("count", "cosine"), [(8, 0.9), (8, 0.99), (16, 0.7), (64, 0.5), (6, 0.3)])
-def test_in_one_band_it_is_the_correlation_coefficient(count: int, cosine: float) -> None:
+@pytest.mark.parametrize(
+    ("count", "dimension", "share"),
+    [(8, 1, 0.9), (8, 1, 0.99), (16, 1, 0.7), (64, 1, 0.5), (6, 1, 0.3), (36, 9, 0.7), (36, 9, 0.9), (72, 3, 0.5)],
+)
+def test_in_one_band_it_is_the_correlation_coefficient(count: int, dimension: int, share: float) -> None:
     one = np.ones(1)
-    exact = betaincc(0.5, (count - 1) / 2.0, cosine**2)
-    assert one_coefficient_p(count * one, cosine * one, one, one) == pytest.approx(exact, rel=0.2)
+    exact = betaincc(dimension / 2.0, (count - dimension) / 2.0, share**2)
+    product = share * np.linspace(1.0, 3.0, dimension)
+    product *= share / np.linalg.norm(product)
+    assert one_series_p(count * one, product[None], one, one) == pytest.approx(exact, rel=0.2)
 
 
-def test_noise_has_every_probability_alike() -> None:
+@pytest.mark.parametrize("dimension", [1, 3])
+def test_noise_has_every_probability_alike(dimension: int) -> None:
     rng = np.random.default_rng(3)
     found = []
-    for _ in range(400):
-        noise = [rng.standard_normal(int(n)) * 10.0 ** rng.uniform(-1.0, 2.0) for n in COUNTS]
-        power = np.array([n @ n for n in noise])
+    for _ in range(160):
+        levels = 10.0 ** rng.uniform(-1.0, 2.0, len(COUNTS))
+        noise = [rng.standard_normal((int(n), dimension)) * one for n, one in zip(COUNTS, levels, strict=True)]
+        power = np.array([np.sum(n**2) for n in noise])
         first = np.array([n[0] for n in noise])  # along a regressor that is all in it
-        found.append(one_coefficient_p(COUNTS, first * np.sqrt(SQUARES), SQUARES, power))
+        found.append(one_series_p(dimension * COUNTS, first * np.sqrt(SQUARES)[:, None], SQUARES, power))
     for level in (0.05, 0.1, 0.3, 0.5):
         assert np.mean(np.array(found) < level) < level + 3.0 * np.sqrt(level * (1.0 - level) / len(found))
     assert np.mean(np.array(found) < 0.5) > 0.3  # and it is a probability, not a bound
@@ -39,8 +46,9 @@ def test_noise_has_every_probability_alike() -> None:
 
 def test_it_does_not_depend_on_the_units() -> None:
     cosines = np.array([0.95, 0.8, 0.5, 0.3, 0.1, 0.0, 0.05, 0.0])
-    p = one_coefficient_p(COUNTS, cosines * np.sqrt(SQUARES * COUNTS), SQUARES, COUNTS)
-    again = one_coefficient_p(COUNTS, 1e-9 * cosines * np.sqrt(SQUARES * COUNTS), 1e-12 * SQUARES, 1e-6 * COUNTS)
+    product = (cosines * np.sqrt(SQUARES * COUNTS))[:, None]
+    p = one_series_p(COUNTS, product, SQUARES, COUNTS)
+    again = one_series_p(COUNTS, 1e-9 * product, 1e-12 * SQUARES, 1e-6 * COUNTS)
     assert 0.0 < p < 1e-3
     assert again == pytest.approx(p, rel=1e-6)
 
