@@ -13,8 +13,9 @@ from scipy.special import chdtrc, chdtri
 from magtensor.error_models.terms import Terms
 from magtensor.loop.evidence.assessment import BORNE_OUT, assess, estimated_in, explained, slow_noise_of
 from magtensor.loop.evidence.grams import Whitened
+from magtensor.loop.evidence.statistics import Gain
 from magtensor.loop.fitting.model import Adopted
-from magtensor.loop.searching.gates import ALPHA, Candidate
+from magtensor.loop.searching.gates import ALPHA, Candidate, adds_to_axes
 from magtensor.loop.searching.outcome import why
 from magtensor.loop.searching.rounds import with_lines
 from magtensor.loop.searching.screening import candidates_of
@@ -66,6 +67,38 @@ def test_a_tone_has_one_way_to_pass(one: Candidate, name: str, significant: bool
         one, model=model, tried=1.0, adjusted_p=0.3, adjusted_own_p=1e-9, assessment=replace(one.assessment, p=1e-3)
     )
     assert changed.significant is significant
+
+
+@pytest.mark.parametrize(
+    ("name", "own_p", "null_focused", "passes"),
+    [
+        ("warm_up", 0.9 * ALPHA, 1.0, True),
+        ("warm_up", 1.1 * ALPHA, 1.0, False),  # slow noise explains it
+        ("warm_up", 0.9 * ALPHA, -1.0, False),  # in noise as strong as the residual's one part does not predict another
+        ("offset_step", 0.9 * ALPHA, 1.0, False),  # its time was sought in all the data
+    ],
+)
+def test_a_drift_that_lies_in_a_few_folds_passes_by_the_spectra_of_the_sensors(
+    one: Candidate, name: str, own_p: float, null_focused: float, passes: bool
+) -> None:
+    """Most of what is gained in one fold, lost in noise of the residual's colour, and short folds that agree."""
+    each = np.ones(10)
+
+    def gain(most: float, others: float) -> Gain:
+        return Gain(1000.0 * each, 1000.0 * each - np.r_[most, others * each[1:]], each)
+
+    assessed = replace(
+        one.assessment, p=1e-4, own_p=own_p, gain=gain(80.0, -1.0), null_gain=gain(-80.0, 0.0),
+        focused=gain(5.0, 6.0), null_focused=gain(null_focused, null_focused),
+    )  # fmt: skip
+    registry = Registry.load()
+    drift = registry.find("error_model", "warm_up").function(linear_state(synthetic(3)).excitation, tau_s=300.0)
+    changed = replace(
+        one, model=Adopted(registry.find("error_model", name), {"tau_s": 300.0}), terms=drift, tried=1.0,
+        adjusted_p=0.01, adjusted_own_p=own_p, adjusted_null_p=0.1, assessment=assessed,
+    )  # fmt: skip
+    assert not changed.assessment.gain.consistent and adds_to_axes(drift)
+    assert changed.passes is passes
 
 
 def test_a_weak_turn_that_twelve_blocks_cannot_prove_among_the_whole_catalogue() -> None:

@@ -16,7 +16,8 @@ from magtensor.loop.evidence.grams import grams
 from magtensor.loop.evidence.own_noise import OwnNoise
 from magtensor.loop.evidence.sensor_noise import smoothed_spectrum
 from magtensor.loop.evidence.statistics import family_p
-from magtensor.loop.fitting.model import State
+from magtensor.loop.fitting.model import Fitting, State
+from magtensor.loop.searching.adopting import adopt
 from magtensor.loop.searching.gates import ALPHA, Candidate
 from magtensor.loop.searching.rounds import with_lines
 from magtensor.loop.searching.screening import candidates_of
@@ -183,3 +184,17 @@ def test_slow_noise_goes_on_in_a_gap() -> None:
     over_time, as_if_no_gap = np.array(p).T
     assert over_time.min() > 1e-3
     assert as_if_no_gap.min() < 1e-6
+
+
+@pytest.mark.parametrize("seed", [6, 8])
+def test_sensors_that_show_an_event_are_kept_with_it(seed: int) -> None:
+    """0.1 nT for a fifth of the time: the scatter of long blocks shows it on one or two of the three."""
+    offset_while = Registry.load().find("error_model", "offset_while")
+    rng = np.random.default_rng(seed)
+    added = 0.05 * np.stack([wandering(rng, 200.0) for _ in range(4)], axis=1)
+    added[600:900] += 0.75 * np.array([[0.2, 0.13, -0.03], [0.0, 0.0, 0.0], [0.2, -0.05, 0.05], [-0.1, 0.15, 0.08]])
+    record = synthetic(700 + seed, SAMPLES, turning_s=4.0, noise_nT=0.15, added=added)
+    state = with_lines(linear_state(record), record)
+    (found,) = candidates_of(state, [offset_while], {}, ALPHA)
+    assert found.passes
+    assert adopt(record, state, found, Fitting()).adopted[0].sensors == ("S1", "S3", "S4")

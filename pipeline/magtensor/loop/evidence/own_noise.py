@@ -62,10 +62,10 @@ class OwnNoise:
         if terms.count == 1 and np.all(terms.part_output == REFERENCE) and self.residual.sighted is None:
             return self._of_one_in_the_reference(terms)
         if self.residual.across is None or not _one_series(terms):
-            return self._by_score(terms)
-        return cauchy_combination([self._by_score(terms), *self._of_one_series(terms)])
+            return self.by_score(terms)
+        return cauchy_combination([self.by_score(terms), *self._of_one_series(terms)])
 
-    def _by_score(self, terms: Terms) -> float:
+    def by_score(self, terms: Terms) -> float:
         """The same of any terms, by the score of their coefficients.
 
         The levels of the noise are those of all that is left, what the terms explain included, and known from few

@@ -18,7 +18,15 @@ from magtensor.loop.fitting.model import Adopted, Fitting, Record, State
 from magtensor.loop.fitting.refit import joint_state
 from magtensor.loop.fitting.separation import SEPARATION
 from magtensor.loop.searching.beginnings import beginning, extent, least_gain, with_beginning
-from magtensor.loop.searching.contribution import KEEP_ALPHA, held_out, put_back, significance, slices
+from magtensor.loop.searching.contribution import (
+    KEEP_ALPHA,
+    happens_once,
+    held_out,
+    put_back,
+    significance,
+    significance_at_once,
+    slices,
+)
 from magtensor.loop.searching.gates import Candidate
 from magtensor.loop.searching.split import coefficients
 
@@ -131,11 +139,9 @@ def _sensors_showing(state: State, which: int) -> tuple[str, ...] | None:
     names = [s for s in state.excitation.sensors if s in owners]
     if len(names) < 2:
         return None
-    showing = [
-        s
-        for s in names
-        if significance(state, [part.start + i for i, o in enumerate(owners) if o == s]) < KEEP_ALPHA / len(names)
-    ]
+    p_of = significance_at_once if happens_once(state.adopted[which]) else significance
+    own = {s: [part.start + i for i, o in enumerate(owners) if o == s] for s in names}
+    showing = [s for s in names if p_of(state, own[s]) < KEEP_ALPHA / len(names)]
     return tuple(showing) if showing and len(showing) < len(names) else None
 
 

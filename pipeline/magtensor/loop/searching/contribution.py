@@ -39,6 +39,16 @@ def significance(state: State, chosen: Sequence[int]) -> float:
     return family_p(_blocks(state), state.terms.sensors, list(chosen))
 
 
+def significance_at_once(state: State, chosen: Sequence[int]) -> float:
+    """The same of something that happened once, of which the scatter over blocks tells nothing: in noise of each
+    sensor's own spectrum."""
+    assert state.terms is not None
+    back = put_back(state.residual, state.terms, np.concatenate(state.theta))
+    others = [i for i in range(state.terms.count) if i not in set(chosen)]
+    given = state.terms.only(others) if others else None
+    return OwnNoise(back, given).by_score(state.terms.only(chosen))
+
+
 def held_out(state: State, given: Sequence[int]) -> Gain:
     """What all other coefficients gain on held-out blocks beside the given ones."""
     assert state.terms is not None
