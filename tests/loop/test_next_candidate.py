@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -14,7 +15,7 @@ from magtensor.error_models.terms import Terms
 from magtensor.loop.fitting.model import Adopted, Fitting, Record, State
 from magtensor.loop.searching import by_hand, outcome, rivals, rounds
 from magtensor.loop.searching.course_of_time import BesideTime
-from magtensor.loop.searching.gates import ALPHA
+from magtensor.loop.searching.gates import ALPHA, Candidate
 from magtensor.registry import Registry
 
 EFFECTS = ({"type": "temperature_offset", "rms_nT": 1.0}, {"type": "nonlinearity_cubic", "rms_nT": 0.6})
@@ -163,6 +164,19 @@ def test_a_step_is_no_part_of_a_drift_unless_it_is(rises: Any, part: str) -> Non
     assert max(step.assessment.gain.total, drift.assessment.gain.total) > 100.0
     assert rivals.part_of_a_drift(step, found, state) == part
     assert not rivals.part_of_a_drift(drift, found, state)  # it lasts
+    for null_p in (0.9 * ALPHA, 1.1 * ALPHA):
+        doubtful = replace(unevenly(drift), adjusted_null_p=null_p)
+        assert rivals.part_of_a_drift(step, [step, doubtful], state) == (part if null_p < ALPHA else "")
+
+
+def unevenly(drift: Candidate) -> Candidate:
+    """The same gain, nearly all of it in two folds."""
+    gain = drift.assessment.gain
+    each = np.full(len(gain.values), -0.01 * gain.total)
+    each[:2] += (gain.total - each.sum()) * np.array([0.8, 0.2])
+    found = replace(gain, after=gain.before - each)
+    assert not found.consistent and found.total == pytest.approx(gain.total)
+    return replace(drift, assessment=replace(drift.assessment, gain=found))
 
 
 @pytest.mark.parametrize(("gain", "words"), [(90.0, "drift explained more"), (110.0, "drift is simpler")])

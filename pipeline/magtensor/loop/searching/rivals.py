@@ -89,14 +89,17 @@ def part_of_a_drift(candidate: Candidate, candidates: Sequence[Candidate], state
     next to nothing; "" where there is none.
 
     A drift is judged by the scatter of long blocks, which tells little of it, and something that happened once is not.
-    Where a drift predicts more on blocks that neither has seen, the event is the place where it is steepest.
+    Where a drift predicts more on blocks that neither has seen, the event is the place where it is steepest. So a drift
+    that predicts unevenly counts as well, if slow noise does not explain it.
     """
     if not happens_once(candidate.model):
         return ""
     least = candidate.assessment.gain.total
     for other in candidates:
         gain = other.assessment.gain
-        if happens_once(other.model) or generic(other.model) or gain.total < least or not gain.consistent:
+        if happens_once(other.model) or generic(other.model) or gain.total < least:
+            continue
+        if not gain.consistent and other.adjusted_null_p >= other.alpha:
             continue
         whole, own, both = _beside(candidate, other, state)
         if own <= whole and both - whole < SMALL_PART * own:
