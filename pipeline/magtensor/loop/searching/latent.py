@@ -29,8 +29,8 @@ from magtensor.loop.evidence.statistics import FOLDS, Gain
 from magtensor.loop.fitting.log_noise import brought_in
 from magtensor.loop.fitting.model import Adopted, Fitting, Record, State
 from magtensor.loop.fitting.refit import joint_state
-from magtensor.loop.searching.gates import OF_THE_LAW, Candidate, explained_before, gained_of_a_log
-from magtensor.loop.searching.likeness import effect_along, followed
+from magtensor.loop.searching.gates import OF_THE_LAW, Candidate, explained_before, explained_by, gained_of_a_log
+from magtensor.loop.searching.likeness import effect_along, followed, of_an_unseen_path
 
 ALPHA = 0.001  # family-wise over the bands
 LEAST_SENSORS = 3  # from here on noise of single sensors does not imitate a factor
@@ -121,6 +121,9 @@ def sought(state: State, record: Record, *, may_follow: bool = False) -> Sought 
         objection = "with two sensors it cannot be told from a disturbance of one of them"
     elif n * float(seen @ seen) <= OF_THE_LAW * explained_before(state):
         objection = "it is less than 5 % of what is adopted, whose laws may leave it"
+    elif (unseen := of_an_unseen_path(state)) and n * float(seen @ seen) <= explained_by(state, unseen):
+        name = state.adopted[unseen[0]].name
+        objection = f"it is less than {name} explains, which remembers the field on the way between the samples"
     elif not gain.consistent:
         objection = "the sensors do not predict each other with it on held-out stretches"
     elif like is not None and not may_follow:

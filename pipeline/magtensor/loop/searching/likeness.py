@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from magtensor.calibration.types import Array
+from magtensor.error_models.waveform import NAME
 from magtensor.loop.fitting.model import Record, State
 
 LIKE_A_CHANNEL = 0.7  # correlation from which a logged channel is the suspect and no hidden source
@@ -12,6 +13,7 @@ MOST_LAG = 0.1  # of the survey, in which a channel is compared with the wavefor
 COMPARED = 400  # points at which it is
 LIKE_AN_EFFECT = 0.9  # cosine; of two directions off the plane of four sensors one pair in a thousand is nearer
 ONE_DIRECTION = 0.9  # of an effect's power
+REMEMBERS = 0.3  # of its size, what other samples change of a regressor that remembers the field there
 
 
 def followed(time: Array, values: Array, record: Record) -> tuple[str, float, int, float] | None:
@@ -66,3 +68,21 @@ def effect_along(state: State, basis: Array, direction: Array) -> str:
         if powers[-1] > ONE_DIRECTION * powers.sum() > 0 and abs(vectors[:, -1] @ direction) > LIKE_AN_EFFECT * size:
             return model.name
     return ""
+
+
+def of_an_unseen_path(state: State) -> list[int]:
+    """The places of the adopted models that remember the field where it turns too far from one sample to the next for
+    the path between them to be known: static postures. What a turn back and forth on the way does, no sample shows."""
+    x = state.excitation
+    if x.turns:
+        return []
+    some = np.arange(0, len(x.time), 2)
+    places = []
+    for place, model in enumerate(state.adopted):
+        if model.name == NAME:
+            continue
+        whole, part = model.terms(x).series[some], model.terms(x.at(some)).series
+        whole, part = whole - whole.mean(axis=0), part - part.mean(axis=0)
+        if np.linalg.norm(whole - part) > REMEMBERS * np.linalg.norm(whole):
+            places.append(place)
+    return places

@@ -1,0 +1,40 @@
+"""What remembers the field, where the way from one sample to the next is not seen."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from loop_cases import adopted_names, linear_state, scenario, synthetic, verdict_of
+
+from magtensor.loop.fitting.model import Adopted
+from magtensor.loop.searching.likeness import of_an_unseen_path
+from magtensor.registry import Registry
+
+POSTURES = {"type": "postures", "random_count": 136, "rest_s": 10.0, "turn_s": 3.0, "average": True}
+ADOPTED = {
+    "nonlinearity_cubic": {},
+    "hysteresis": {"half_width_nT": 4000.0},
+    "offset_drift": {"order": 2, "span_s": 1200.0},
+    "viscous_magnetisation": {"tau_s": 2.0},
+    "offset_step": {"time_s": 500.0},
+}
+
+
+@pytest.mark.parametrize(("turning_s", "places"), [(0.0, [1, 3]), (8.0, [])])
+def test_memory_is_known_by_what_other_samples_change(turning_s: float, places: list[int]) -> None:
+    state = linear_state(synthetic(5, turning_s=turning_s))
+    registry = Registry.load()
+    adopted = tuple(Adopted(registry.find("error_model", n), settings) for n, settings in ADOPTED.items())
+    state = replace(state, adopted=adopted)
+    assert state.excitation.turns == (turning_s > 0.0)
+    assert of_an_unseen_path(state) == places
+
+
+@pytest.mark.parametrize("seed", [71, pytest.param(76, marks=pytest.mark.long)])
+def test_what_hysteresis_leaves_between_postures_is_no_source(seed: int, tmp_path: Path) -> None:
+    """The play operator went back and forth on the way to each posture; the sensors share what that did."""
+    effect = {"type": "hysteresis", "rms_nT": 0.06, "half_width_nT": [4000.0]}
+    told = verdict_of(tmp_path, scenario(seed, effect, motion=POSTURES), None, ["hysteresis", "latent_source"])
+    assert adopted_names(told) == {"hysteresis"}
