@@ -16,7 +16,7 @@ from magtensor.loop.correcting.correction import corrected_raw, hidden_waveform
 from magtensor.loop.evidence.factor import noise_alone, with_factor
 from magtensor.loop.fitting.model import Adopted, Fitting, Record
 from magtensor.loop.fitting.refit import joint_state
-from magtensor.loop.searching.latent import ALPHA, shared_words, sought, tried_source
+from magtensor.loop.searching.latent import ALPHA, _strongest, shared_words, sought, tried_source
 from magtensor.registry import Registry
 from magtensor.tensor.geometry import array_design, standard_geometry
 
@@ -49,6 +49,25 @@ def test_noise_of_single_sensors_is_no_common_factor(sensors: int) -> None:
         z = own_noise(rng, 200, sensors) @ basis
         p.append(np.exp(noise_alone(z.T @ z / 200, basis, by_sensor(sensors)).log_p(200)))
     assert kstest(p, "uniform").pvalue > 0.001
+
+
+def test_noise_that_grows_quieter_in_all_sensors_is_no_common_factor() -> None:
+    """Where it is loud in all of them together, it tells as little as a shorter survey."""
+    smallest = []
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        basis = plane(rng, 4)
+        loud = np.where(np.arange(3000) < 900, 3.0, 0.3)[:, None]
+        smallest.append(_strongest(own_noise(rng, 3000, 4) * loud @ basis, basis, by_sensor(4)).p)
+    assert min(smallest) > 0.01 / len(smallest)
+
+
+def test_a_source_that_comes_and_goes_tells_as_much_as_before() -> None:
+    rng = np.random.default_rng(0)
+    basis = plane(rng, 4)
+    wave = np.repeat(rng.random(50) < 0.3, 60).astype(float) * (np.arange(3000) < 1500)
+    z = (own_noise(rng, 3000, 4) + 0.4 * np.outer(wave, rng.standard_normal(12))) @ basis
+    assert _strongest(z, basis, by_sensor(4)).p < 1e-12
 
 
 def test_a_factor_is_told_from_noise_and_its_direction_found() -> None:

@@ -35,7 +35,7 @@ from magtensor.loop.searching.likeness import effect_along, followed, of_an_unse
 ALPHA = 0.001  # family-wise over the bands
 LEAST_SENSORS = 3  # from here on noise of single sensors does not imitate a factor
 LEAST_BAND = 6  # coefficients of the lowest band for each value across
-_PARTS = 6  # of a band, in which the noise of different values may have different power
+_PARTS = 6  # of a band and of the survey, in which the noise of different values may have different power
 QUIET = 5.0  # times the median square of a step: of a few dozen values none is as large by chance
 LEVEL_ROUNDS = 3
 LEAST_NOISE = 0.1  # of what the fit believes
@@ -311,23 +311,35 @@ def _strongest(white: Array, basis: Array, groups: Groups) -> _Test:
         own = coefficients[1 : band + 1]
         covariance = own.T @ own / band
         alone = noise_alone(covariance, basis, groups)
-        p = min(1.0, float(np.exp(alone.log_p(_effective(own, covariance)))) * len(bands))
+        effective = _effective(own, lowest(white, band), covariance)
+        p = min(1.0, float(np.exp(alone.log_p(effective))) * len(bands))
         tests.append(_Test(band, covariance, alone, p))
     return max(tests, key=lambda t: t.band * t.alone.deviance)
 
 
-def _effective(coefficients: Array, covariance: Array) -> float:
-    """How many coefficients of one colour tell as much: fewer than (K, m) where the values differ in colour.
+def _effective(coefficients: Array, course: Array, covariance: Array) -> float:
+    """How many coefficients of one colour and of one strength all the time tell as much.
 
-    The covariance of two independent series of powers p and q over frequency varies as the mean of p q does.
+    Parameters
+    ----------
+    coefficients: (K, m) of a band; course: (N, m) the same over time.
     """
-    values, vectors = np.linalg.eigh(covariance)
-    unit = coefficients @ (vectors / np.sqrt(np.maximum(values, 1e-12 * values[-1])))
+    return len(coefficients) / (_unevenness(coefficients, covariance) * _unevenness(course, covariance))
+
+
+def _unevenness(values: Array, covariance: Array) -> float:
+    """By what factor fewer values (K, m) tell as much, where their powers rise and fall together from part to part.
+
+    The covariance of two independent series of powers p and q varies as the mean of p q does.
+    """
+    values = values / np.sqrt(max(float(np.mean(values**2)), 1e-300) * len(covariance) / np.trace(covariance))
+    powers, vectors = np.linalg.eigh(covariance)
+    unit = values @ (vectors / np.sqrt(np.maximum(powers, 1e-12 * powers[-1])))
     power = np.stack([np.mean(part**2, axis=0) for part in np.array_split(unit, _PARTS)])
     products = power.T @ power / _PARTS
     m = len(covariance)
     alike = (products.sum() - np.trace(products)) / (m * (m - 1))
-    return len(coefficients) / max(alike, 1.0)
+    return max(float(alike), 1.0)
 
 
 def lowest(series: Array, band: int) -> Array:
