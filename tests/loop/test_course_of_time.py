@@ -103,6 +103,7 @@ def test_a_law_of_time_goes_from_its_start_to_its_end(law: str) -> None:
     np.testing.assert_allclose([first[0], first[-1]], [-1.0, 1.0], atol=1e-12)
 
 
+@pytest.mark.long
 def test_scale_factors_that_age_as_the_logarithm_of_time(tmp_path: Path) -> None:
     """As those of CHAMP did (Yin and Luhr 2011); switched on a hundredth of the survey before it began."""
     ppm = 120.0 * np.random.default_rng(6).standard_normal((4, 3))

@@ -81,6 +81,7 @@ def test_delays_of_sensors_are_found_to_all_orders(tmp_path: Path, rate_Hz: floa
     assert told["adopted"][0]["evidence"]["held_out_rms_after_nT"] < 1.3 * NOISE_NT
 
 
+@pytest.mark.long
 def test_a_second_survey_is_brought_back_to_its_time(tmp_path: Path) -> None:
     """As if nothing were late, but for the last sample, which has not been recorded."""
     effect = late(0.0, 0.0, 0.1, 0.0)

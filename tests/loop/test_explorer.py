@@ -92,6 +92,7 @@ def test_the_result_says_who_did_what_and_can_be_made_again(tmp_path: Path, expl
     assert json.loads((tmp_path / "again" / "verdict.json").read_text()) == verdict
 
 
+@pytest.mark.long
 def test_the_loop_alone_is_close_loop(explorer: Explorer, survey: Path) -> None:
     explorer.run_loop()
     by_itself = magtensor.close_loop(survey, search=SEARCH, most_effects=2)

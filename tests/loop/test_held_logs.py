@@ -59,7 +59,8 @@ def test_a_rounded_log_that_flickers_does_not_swing() -> None:
     assert found.min() >= flickering.min() - 0.01 and found.max() <= flickering.max() + 0.01
 
 
-@pytest.mark.parametrize("held", [pytest.param(False, marks=pytest.mark.long), True])
+@pytest.mark.long
+@pytest.mark.parametrize("held", [False, True])
 def test_a_temperature_offset_keeps_its_lag_and_needs_no_helper(held: bool, tmp_path: Path) -> None:
     def hold(path: Path) -> None:
         with h5py.File(path, "a") as file:

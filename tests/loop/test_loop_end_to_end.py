@@ -207,7 +207,10 @@ def test_limited_tilt(tmp_path: Path, effect: dict[str, Any] | None) -> None:
         assert "temperature_offset" in suspects(found)
 
 
-@pytest.mark.parametrize("effect", [None, {"type": "temperature_offset", "rms_nT": 3.0, "lag_s": 100.0}])
+@pytest.mark.parametrize(
+    "effect",
+    [None, pytest.param({"type": "temperature_offset", "rms_nT": 3.0, "lag_s": 100.0}, marks=pytest.mark.long)],
+)
 def test_static_postures(tmp_path: Path, effect: dict[str, Any] | None) -> None:
     description = yaml.safe_load(POSTURES.read_text()) | {"rate_Hz": 2.0, "effects": [effect] if effect else []}
     found = verdict_of(tmp_path, description, models=lasting_effects() if effect else None)

@@ -86,7 +86,8 @@ def test_two_ways_of_the_heat_are_two_lags_of_one_thermometer(tmp_path: Path) ->
 VISCOUS = ("viscous_magnetisation", "hysteresis", "eddy_current", "sampling_lag", "bandwidth")
 
 
-@pytest.mark.parametrize("taus", [(8.0,), pytest.param((2.0, 60.0), marks=pytest.mark.long)], ids=["one", "two"])
+@pytest.mark.long
+@pytest.mark.parametrize("taus", [(8.0,), (2.0, 60.0)], ids=["one", "two"])
 def test_what_a_time_constant_leaves_is_another_one_and_no_other_effect(
     taus: tuple[float, ...], tmp_path: Path
 ) -> None:

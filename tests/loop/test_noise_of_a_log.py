@@ -61,6 +61,7 @@ def test_an_effect_of_the_voltage_beside_that_of_a_noisy_current_is_found(tmp_pa
     assert adopted_names(told) == {"current_field", "supply_offset"}
 
 
+@pytest.mark.long
 def test_of_two_logs_of_one_cause_the_noisier_is_named_as_a_rival(tmp_path: Path) -> None:
     survey = on_a_bus(MOTOR, current_noise_A=0.03)
     survey["channels"]["supply_voltage"]["loads"] = ["current_motor"]

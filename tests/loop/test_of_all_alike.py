@@ -53,6 +53,7 @@ def test_a_base_station_that_follows_the_temperature_is_no_fault_of_the_sensors(
     assert told["unexplained"]["present"]
 
 
+@pytest.mark.long
 def test_scale_factors_that_follow_the_temperature_each_by_its_own_are_the_sensors(tmp_path: Path) -> None:
     told = verdict_of(tmp_path, scenario(61, {"type": "temperature_scale", "rms_nT": 0.3}), models=FOLLOWING)
     assert [a["error_model"] for a in told["adopted"]] == ["temperature_scale"]

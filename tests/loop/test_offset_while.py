@@ -42,6 +42,7 @@ def test_it_is_found_with_both_times(tmp_path: Path, sensors: int, strength: flo
     assert not told["unexplained"]["present"], told["unexplained"]
 
 
+@pytest.mark.long
 def test_a_jump_for_good_is_a_step(tmp_path: Path) -> None:
     told = verdict_of(tmp_path, scenario(12, magnet(0.6, 4)[0]), models=MODELS)
     assert adopted_names(told) == {"offset_step"}

@@ -33,7 +33,7 @@ def test_in_one_band_it_is_the_correlation_coefficient(count: int, dimension: in
 def test_noise_has_every_probability_alike(dimension: int) -> None:
     rng = np.random.default_rng(3)
     found = []
-    for _ in range(160):
+    for _ in range(80):
         levels = 10.0 ** rng.uniform(-1.0, 2.0, len(COUNTS))
         noise = [rng.standard_normal((int(n), dimension)) * one for n, one in zip(COUNTS, levels, strict=True)]
         power = np.array([np.sum(n**2) for n in noise])
@@ -79,5 +79,5 @@ def test_a_step_of_the_size_of_the_noise_is_beyond_all_that_is_tried(tmp_path: P
 
 
 def test_a_base_station_that_walks_has_no_steps(tmp_path: Path) -> None:
-    walks = [p_of_a_step(tmp_path, added=slow_noise(2400, seed)) for seed in range(8)]
-    assert min(walks) > 0.005 / 8 / 11  # of eight walks and eleven times each
+    walks = [p_of_a_step(tmp_path, added=slow_noise(2400, seed)) for seed in range(4)]
+    assert min(walks) > 0.005 / 4 / 11  # of four walks and eleven times each

@@ -67,7 +67,8 @@ def lags(told: dict[str, Any]) -> list[float]:
     return sorted(a["settings"]["lag_s"] for a in told["adopted"] if a["error_model"] == "temperature_offset")
 
 
-@pytest.mark.parametrize("seed", [5, pytest.param(6, marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("seed", [5, 6])
 def test_two_time_constants_are_two_of_a_kind(seed: int, tmp_path: Path) -> None:
     told = verdict_of(tmp_path, thermal(seed), warmed({30.0: 0.5, 900.0: 0.5}, rms_nT=4.0), THERMAL)
     assert adopted_names(told) == {"temperature_offset"}
