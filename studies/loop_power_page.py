@@ -43,7 +43,7 @@ def seen(row: Row) -> bool:
 
 def affordable(row: Row) -> bool:
     """Whether the oracle finds the effect where it pays for all that the loop tries."""
-    return row["oracle"] is not None and row["oracle"] * row.get("tests", 1.0) < ORACLE_LEVEL
+    return row["oracle"] is not None and row["oracle"] * row["tests"] < ORACLE_LEVEL
 
 
 def by_rival(row: Row) -> bool:

@@ -10,6 +10,7 @@ import pytest
 from loop_cases import Array, linear_state, synthetic
 from scipy.signal import lfilter
 
+from magtensor.error_models.terms import joined
 from magtensor.loop.evidence.assessment import block_count
 from magtensor.loop.evidence.colour import colour_of
 from magtensor.loop.evidence.grams import grams
@@ -198,3 +199,16 @@ def test_sensors_that_show_an_event_are_kept_with_it(seed: int) -> None:
     (found,) = candidates_of(state, [offset_while], {}, ALPHA)
     assert found.passes
     assert adopt(record, state, found, Fitting()).adopted[0].sensors == ("S1", "S3", "S4")
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize(("samples", "sensors", "given"), [(136, 3, 16), (300, 9, 30)])
+def test_beside_series_that_take_all_of_the_lowest_octaves(samples: int, sensors: int, given: int) -> None:
+    """Nothing is left to tell the noise there by, and nothing of what is slow."""
+    state = linear_state(synthetic(1, samples, sensors=sensors, noise_nT=0.3))
+    x, all_of_them = state.excitation, state.residual.samples
+    drift = Registry.load().find("error_model", "warm_up").function(x, tau_s=samples / 5.0)
+    time = np.linspace(0.0, 1.0, len(x.time))
+    taken = [replace(drift, series=np.cos(np.pi * k * time)[:, None]) for k in range(1, given + 1)]
+    p = OwnNoise(state.residual, joined(taken).at(all_of_them)).p_value(drift.at(all_of_them))
+    assert 0.01 < p <= 1.0

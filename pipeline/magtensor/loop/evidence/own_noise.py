@@ -24,11 +24,11 @@ from magtensor.loop.evidence.one_series import one_series_p
 from magtensor.loop.evidence.residual import Residual
 from magtensor.loop.evidence.sensor_noise import (
     LEAST,
-    OCTAVE,
     SensorNoise,
     bands,
     grams_in_bands,
     inverse_of,
+    octaves,
     over_frequency,
     smoothed_spectrum,
 )
@@ -36,6 +36,7 @@ from magtensor.loop.evidence.statistics import Own, cauchy_combination, fisher_c
 
 MOST_MISSING = 0.25  # of the samples: longer gaps are shortened to that
 _INNER_RANK = 1e-6  # of the largest singular value
+_LEAST_SEEN = 1e-9  # of what is known of the best axis of a sensor, of the others
 _LEAST_REFERENCE = 0.1  # of the power along the field, which is not the sensors'
 
 
@@ -56,8 +57,8 @@ class OwnNoise:
 
         Of one coefficient of the reference, and of one series that is added to outputs of the sensors, the exact law is
         known (`one_series`). Of the sensors it is asked in what differs between them: of each beside all others, which
-        shows what one of them does, and of each beside those that are quieter, which is independent of each other and
-        put together (Fisher 1925).
+        shows what one of them does, and of each beside those that are quieter: these are independent and are put
+        together (Fisher 1925).
         """
         if terms.count == 1 and np.all(terms.part_output == REFERENCE) and self.residual.sighted is None:
             return self._of_one_in_the_reference(terms)
@@ -160,6 +161,7 @@ class OwnNoise:
             weight = np.diag(1.0 / power[outputs])
             weight -= weight @ plane @ np.linalg.solve(plane.T @ weight @ plane, plane.T @ weight)
             level, axes = np.linalg.eigh(into @ weight @ into.T)
+            level = np.maximum(level, _LEAST_SEEN * level[-1])
             alike = (
                 weight @ into.T @ axes / np.sqrt(level) @ axes.T
             )  # to directions in which noise is one, alike in all
@@ -369,8 +371,7 @@ def _in_octaves(column: Array, values: Array, taken: Array) -> float:
     taken: (N, Q) orthonormal, what has been projected off all of these.
     """
     count, dimension = values.shape
-    octaves = OCTAVE * 2 ** np.arange(max(int(np.log2(count)), 1))
-    edges = np.concatenate([[1], octaves[octaves < count // 2], [count]])
+    edges = octaves(count)
 
     def sums(each: Array) -> Array:
         return np.add.reduceat(each, edges[:-1])

@@ -17,6 +17,7 @@ OCTAVE = 4  # frequencies in the lowest one
 NARROW = 4  # parts of an octave
 BAND = 8  # frequencies in the lowest band in which sensors are compared
 ALIKE = 4.0  # values that the axes of one sensor are taken to be alike by
+_LEAST_POWER = 1e-12  # of the largest
 _SMOOTHING = 8  # rounds in which a course between the middles of octaves gets their levels
 _SCORING = 30  # rounds in which the levels of the sensors are found
 
@@ -92,6 +93,7 @@ class SensorNoise:
             course = np.ones(len(power)) if law is None else law
             for (i, j), count, level in zip(pairwise(self.edges), self.counts, self.levels[:, own], strict=True):
                 power[i:j, own] = level * (course[i:j] * count / max(held[i:j] @ course[i:j], 1e-300))[:, None]
+        power = np.maximum(power, _LEAST_POWER * power.max())  # where series took all that there was
         edges = np.unique(np.round(OCTAVE * 2.0 ** np.arange(0.0, np.log2(len(power)), 1.0 / NARROW)).astype(int))
         edges = np.concatenate([np.arange(OCTAVE), edges[(edges >= OCTAVE) & (edges < len(power))], [len(power)]])
         return [(slice(i, j), power[i:j].mean(axis=0)) for i, j in pairwise(edges)]
@@ -107,10 +109,16 @@ class SensorNoise:
         return colour_of(idct(differs * self.root[:, None], axis=0, norm="ortho"), stiff=True, left=self.left)
 
 
+def octaves(count: int) -> NDArray[np.int_]:
+    """(B + 1,) edges of octaves of so many frequencies, the mean left out."""
+    edges = OCTAVE * 2 ** np.arange(max(int(np.log2(count)), 1))
+    return np.concatenate([[1], edges[edges < count // 2], [count]])
+
+
 def bands(count: int) -> NDArray[np.int_]:
     """(B + 1,) edges of octaves of so many frequencies, wide enough to compare sensors in."""
-    octaves = BAND * 2 ** np.arange(max(int(np.log2(count)), 1))
-    return np.concatenate([[0], octaves[octaves < count // 2], [count]])
+    edges = BAND * 2 ** np.arange(max(int(np.log2(count)), 1))
+    return np.concatenate([[0], edges[edges < count // 2], [count]])
 
 
 def smoothed_spectrum(power: Array, left: Array | None = None) -> Array:
@@ -124,10 +132,7 @@ def smoothed_spectrum(power: Array, left: Array | None = None) -> Array:
     n = len(power)
     if n < LEAST:
         return np.full(n, max(float(np.sum(power[1:]) / max(n - 1 if left is None else left[1:].sum(), 1.0)), 1e-300))
-    octaves = OCTAVE * 2 ** np.arange(int(np.log2(n)))
-    edges = np.concatenate([[1], octaves[octaves < n // 2], [n]])
-    place = np.log(np.arange(1, n))
-
+    edges, place = octaves(n), np.log(np.arange(1, n))
     part = np.ones(n - 1) if left is None else np.maximum(left[1:], 1e-9)
     parts = np.add.reduceat(part, edges[:-1] - 1)
 
