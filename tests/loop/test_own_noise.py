@@ -10,6 +10,7 @@ import pytest
 from loop_cases import Array, linear_state, synthetic
 from scipy.signal import lfilter
 
+from magtensor.error_models.station import Station
 from magtensor.error_models.terms import joined
 from magtensor.loop.evidence.assessment import block_count
 from magtensor.loop.evidence.colour import colour_of
@@ -185,6 +186,42 @@ def test_slow_noise_goes_on_in_a_gap() -> None:
     over_time, as_if_no_gap = np.array(p).T
     assert over_time.min() > 1e-3
     assert as_if_no_gap.min() < 1e-6
+
+
+def read_rarely(seed: int, every: int, noise_nT: float) -> State:
+    """A survey whose base station is read once in so many samples, with noise of its own."""
+    record = synthetic(seed, SAMPLES, turning_s=4.0, noise_nT=0.1)
+    assert record.total_field is not None
+    rng, at = np.random.default_rng(seed), np.arange(0, SAMPLES + every, every)
+    read = np.interp(record.time, at, np.interp(at, record.time, record.total_field) + rng.normal(0, noise_nT, len(at)))
+    station = Station(at.astype(float), np.interp(at, record.time, read))
+    return linear_state(replace(record, total_field=read, station=station))
+
+
+def test_readings_that_are_far_apart_are_no_more_than_they_are() -> None:
+    """The noise of a base station that is read every thirty samples has fifty values, not 1500: what is drawn from one
+    to the next is no evidence of its own."""
+    p = []
+    for seed in range(300, 304):
+        state = read_rarely(seed, 30, 0.3)
+        station, rng = state.excitation.readings, np.random.default_rng(seed + 1000)
+        both = [OwnNoise(r, None) for r in (state.residual, replace(state.residual, reading_s=0.0))]
+        for _ in range(15):
+            another = np.interp(state.excitation.time, station.time, rng.standard_normal(len(station.time)))
+            terms = state.excitation.on_reference(another, "nT", "another").at(state.residual.samples)
+            p.append([noise.p_value(terms) for noise in both])
+    as_read, as_if_every_sample = np.array(p).T
+    assert np.mean(as_read < 0.1) < 0.2
+    assert as_read.min() > 1e-3
+    assert as_if_every_sample.min() < 1e-4
+
+
+def test_what_the_fit_takes_of_a_reference_is_no_evidence() -> None:
+    """A constant is a scale of all sensors but for the variation of the field, which holds the station's noise."""
+    state = read_rarely(310, 30, 0.3)
+    x = state.excitation
+    constant = x.on_reference(np.full(len(x.time), 1.0), "nT", "level").at(state.residual.samples)
+    assert OwnNoise(state.residual, None).p_value(constant) == 1.0
 
 
 @pytest.mark.parametrize("seed", [6, 8])

@@ -41,6 +41,11 @@ class Station:
 
         return PchipInterpolator(self.time, self.field) if self.smooth and len(self.time) > 2 else None
 
+    @property
+    def step_s(self) -> float:
+        """Median time between its readings."""
+        return float(np.median(np.diff(self.time)))
+
     def reach(self, time: Array) -> float:
         """The share of the times (N,) s between the first and the last reading."""
         return float(np.mean((time >= self.time[0]) & (time <= self.time[-1])))

@@ -32,9 +32,16 @@ from magtensor.loop.evidence.sensor_noise import (
     over_frequency,
     smoothed_spectrum,
 )
-from magtensor.loop.evidence.statistics import Own, cauchy_combination, fisher_combination, identifiable
+from magtensor.loop.evidence.statistics import (
+    IDENTIFIABLE,
+    Own,
+    cauchy_combination,
+    fisher_combination,
+    identifiable,
+)
 
 MOST_MISSING = 0.25  # of the samples: longer gaps are shortened to that
+LEAST_RESOLVED = 8  # frequencies, of the shortest surveys
 _INNER_RANK = 1e-6  # of the largest singular value
 _LEAST_SEEN = 1e-9  # of what is known of the best axis of a sensor, of the others
 _LEAST_REFERENCE = 0.1  # of the power along the field, which is not the sensors'
@@ -109,17 +116,23 @@ class OwnNoise:
         return max(float(betaincc(rank / 2.0, (freedom - rank) / 2.0, share_of_all)), float(chdtrc(rank, explained)))
 
     def _of_one_in_the_reference(self, terms: Terms) -> float:
-        """The same of a single coefficient that is seen in |b| - F alone, octave by octave."""
+        """The same of a single coefficient that is seen in |b| - F alone, octave by octave, up to the frequencies that
+        the readings of the base station resolve: beyond these its noise is what was drawn from one reading to the next,
+        and has no independent values.
+        """
         if self.residual.along is None:
             return 1.0
         every = terms if self.given is None else joined([terms, self.given])
         series = over_frequency(self._even(along_the_field(self.residual, [every]).made)) / self._root_along[:, None]
-        column, others = series[:, 0], series[:, 1:]
+        whole, others = series[:, 0], series[:, 1:]
         free = self._free_along
         more, size, _ = np.linalg.svd(others - free @ (free.T @ others), full_matrices=False)
         taken = np.column_stack([free, more[:, size > _INNER_RANK * max(size.max(initial=0.0), 1.0)]])
-        column, values = (each - taken @ (taken.T @ each) for each in (column, self._values_along))
-        return _in_octaves(column, values[:, None], taken)
+        column, values = (each - taken @ (taken.T @ each) for each in (whole, self._values_along))
+        if np.sum(column**2) <= IDENTIFIABLE * np.sum(whole**2):
+            return 1.0
+        resolved = slice(self._resolved)
+        return _in_octaves(column[resolved], values[resolved, None], taken[resolved])
 
     def _of_one_series(self, terms: Terms) -> tuple[float, float]:
         """The same of a series that is added to outputs of sensors, by what differs between these: that any of them
@@ -260,6 +273,16 @@ class OwnNoise:
                 parts.append(grams_in_bands(own, edges) * levels[:, None, None])
                 counts.append(each * (sensors - 1) / sensors)
         return np.concatenate(parts), np.concatenate(counts)
+
+    @property
+    def _resolved(self) -> int:
+        """How many of the lowest frequencies the readings of the base station resolve."""
+        residual = self.residual
+        count = len(self._along)
+        if residual.time is None or residual.reading_s <= 0:
+            return count
+        a_reading = residual.reading_s / float(np.median(np.diff(residual.time)))
+        return max(int(count / max(a_reading, 1.0)), LEAST_RESOLVED)
 
     @cached_property
     def _between(self) -> Array | None:

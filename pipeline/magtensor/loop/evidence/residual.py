@@ -81,6 +81,7 @@ class Residual:
         slow_modes: how slow noise of the sensors shows along.
         sighted: known directions; levels: unknown constants, which `along` and `inner` have been freed of.
         time: (N,) s of the samples, where they are of one survey.
+        reading_s: s between readings of the base station; 0 where they are not known.
     """
 
     across: Array | None
@@ -96,6 +97,7 @@ class Residual:
     sighted: Sighted | None = None
     levels: Levels | None = None
     time: Array | None = None
+    reading_s: float = 0.0
 
     @cached_property
     def gain(self) -> Array:

@@ -113,7 +113,8 @@ def _state(
 ) -> State:
     """What a fit of outputs and total field, with the effects taken off, leaves."""
     entire = residual_of(fit, raw, reference, how.reference_noise)
-    entire = replace(entire, time=record.time[entire.samples])
+    reading_s = 0.0 if record.station is None else record.station.step_s
+    entire = replace(entire, time=record.time[entire.samples], reading_s=reading_s)
     residual = quick(entire)
     terms = joined([a.terms(x) for a in adopted]).at(residual.samples) if adopted else None
     left_out = None if residual is entire else entire

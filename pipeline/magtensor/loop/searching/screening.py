@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from math import log
 from typing import Any
 
 import numpy as np
@@ -69,7 +70,7 @@ def _ranked(state: State, models: Sequence[Component], failed: dict[str, str], a
         for settings, tried in best_settings(model, state, few, fails, alpha / max(len(models), 1)):
             terms = more.terms(model, settings, fails)
             if terms is not None and terms.count:
-                rows.append((settings, tried, more.white(terms), more.coloured(terms)))
+                rows.append((settings, tried, more.white(terms) - log(tried), more.coloured(terms) - log(tried)))
         return rows, fails
 
     scored = []
@@ -80,7 +81,7 @@ def _ranked(state: State, models: Sequence[Component], failed: dict[str, str], a
 
 
 def _scored_on_all(state: State, scored: Sequence[_Screened], failed: dict[str, str]) -> list[_Screened]:
-    """Those that explain most, as they do on all samples."""
+    """Those that chance explains least, as they do on all samples."""
     residual = state.residual
     white, coloured = Scorer(residual, state.terms, WHITE), Scorer(residual, state.terms, state.colours)
     first = [sorted(scored, key=key, reverse=True)[:SCREENED] for key in (lambda s: s.white, lambda s: s.coloured)]
@@ -89,7 +90,7 @@ def _scored_on_all(state: State, scored: Sequence[_Screened], failed: dict[str, 
         terms = terms_of(each.model, each.settings, state.excitation, failed)
         assert terms is not None
         terms = terms.at(residual.samples)
-        return white(terms), coloured(terms)
+        return white(terms) - log(each.tried), coloured(terms) - log(each.tried)
 
     promising = [s for s in scored if any(s in some for some in first)]
     found = shared_out(on_all, promising)
@@ -138,7 +139,8 @@ def _holm(values: Sequence[float], models: int) -> list[float]:
 
 @dataclass(frozen=True)
 class _Screened:
-    """A model with settings, and what it explains in white noise and in noise of the residual's colour."""
+    """A model with settings, and how unlikely it is that chance explains as much in white noise and in noise of the
+    residual's colour: -log of the p value, corrected for the settings that were tried."""
 
     model: Component
     settings: dict[str, Any]
@@ -148,11 +150,11 @@ class _Screened:
 
     def promises(self, models: int) -> bool:
         """Whether it may be significant among so many models when it is looked at closely."""
-        return bool(np.exp(-max(self.white, self.coloured)) * self.tried * models < HOPELESS)
+        return bool(np.exp(-max(self.white, self.coloured)) * models < HOPELESS)
 
 
 def _shortlist(scored: Sequence[_Screened], score: Callable[[_Screened], float], models: int) -> list[_Screened]:
-    """The models that explain most, each with the settings that do; of the hopeless ones hardly any."""
+    """The models that chance explains least, each with the settings that do; of the hopeless ones hardly any."""
     best: dict[str, _Screened] = {}
     for each in scored:
         if each.model.name not in best or score(each) > score(best[each.model.name]):
