@@ -135,7 +135,7 @@ def test_a_reference_that_covers_half(
     half = contents.values["reference/time"] < 125
     for name in ("reference/time", "reference/total_field"):
         contents.values[name] = contents.values[name][half]
-    last = contents.values["reference/time"][-1] + 2.0  # the end's value holds for one step
+    last = contents.values["reference/time"][-1] + 2.0  # it goes on for one step
     bench("chi", contents).refused("does not cover 2[0-9]{2} of 500 samples", "uncovered: mask")
     beyond = sound_contents.time > last
     right(bench("joint", contents), truth, sound_contents, beyond, "the reference does not cover")

@@ -103,6 +103,24 @@ def test_a_reference_that_ends_early() -> None:
     assert np.isfinite(given["diurnal"][2]["base_nT"])
 
 
+@pytest.mark.parametrize("at", [-4.0, 64.0])
+def test_the_reference_goes_on_for_a_step(at: float) -> None:
+    """0.15 nT/s and a reading each five seconds: the last one held would be 0.6 nT off four seconds later."""
+    time = np.arange(0.0, 61.0, 5.0)
+    rng = np.random.default_rng(3)
+    noises = 0.02 * rng.standard_normal((400, len(time)))
+    found = [sample(np.array([at]), time, 0.15 * time + each, smooth=True, max_gap_s=25.0) for each in noises]
+    wrong = np.array([f.values[0] for f in found]) - 0.15 * at
+    assert found[0].covered.all()
+    assert abs(wrong.mean()) < 0.02 / 5  # of 400 draws
+    assert wrong.std() == pytest.approx(0.02 * found[0].weight_norm[0], rel=0.15)
+
+
+def test_two_readings_make_a_line() -> None:
+    found = sample(np.array([-0.5, 0.5, 1.5]), np.array([0.0, 1.0]), np.array([10.0, 12.0]), smooth=True, max_gap_s=5.0)
+    np.testing.assert_allclose(found.values, [9.0, 11.0, 13.0])
+
+
 def test_a_gap_in_the_reference() -> None:
     time = np.delete(np.arange(0.0, 41.0), slice(11, 20))
     survey = survey_with(time, np.full(len(time), 48_000.0))

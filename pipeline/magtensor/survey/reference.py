@@ -12,6 +12,7 @@ from magtensor.survey.recorded_numbers import resolution
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
+ENDS = 4  # samples whose line a record goes on along: of two it would be mostly their noise
 SPIKE_WINDOW = 7  # samples; three good neighbours on each side outvote a spike of up to three samples
 SPIKE_ALONE = 0.7  # of its deviation from the cubic: both are the spike's height, and half a step's from the cubic
 LEFT_BESIDE = 0.25  # of its deviation from the cubic: a lone spike leaves nothing at its neighbours, a step a third
@@ -36,13 +37,16 @@ class Sampled:
 def sample(at: Floats, time: Floats, values: Floats, *, smooth: bool, max_gap_s: float) -> Sampled:
     """A record at other times, never above or below the two samples between which a time lies.
 
+    Within one median step of an end it goes on along the line through its last samples: where the field moves fast and
+    the readings are far apart, the last one held would be wrong by what it moves in a step.
+
     Args:
         at: (M,) s.
         time: (N,) s, strictly increasing, N >= 1.
         values: (N,) finite.
         smooth: monotone cubic (Fritsch and Carlson 1980, as PCHIP) instead of straight lines.
         max_gap_s: a longer step of the record is a gap, and so is everything beyond its ends by more than one
-            median step; within one median step of an end the end's value holds.
+            median step.
     """
     if len(time) == 1:
         covered = np.abs(at - time[0]) <= max_gap_s
@@ -64,7 +68,14 @@ def sample(at: Floats, time: Floats, values: Floats, *, smooth: bool, max_gap_s:
     else:
         found = values[right - 1] * (1.0 - weight) + values[right] * weight
     found = np.where(weight == 1.0, values[right], np.where(weight == 0.0, values[right - 1], found))
-    return Sampled(np.where(covered, found, np.nan), covered, np.hypot(1.0 - weight, weight))
+    norm = np.hypot(1.0 - weight, weight)
+    for out, end in ((at < time[0], slice(None, ENDS)), (at > time[-1], slice(-ENDS, None))):
+        beyond, own = (at - inside)[out], time[end] - time[end].mean()
+        slope = own / np.sum(own**2)  # as a sum of the samples: a line of least squares
+        found[out] += beyond * float(slope @ values[end])
+        last = 0 if end.start is None else -1
+        norm[out] = np.sqrt(1.0 + 2.0 * beyond * slope[last] + beyond**2 * float(slope @ slope))
+    return Sampled(np.where(covered, found, np.nan), covered, norm)
 
 
 def spikes(values: Floats, threshold: float) -> Bools:
