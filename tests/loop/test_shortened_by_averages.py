@@ -23,6 +23,7 @@ RIVALS = (
     "averaging", "sampling_lag", "bandwidth", "eddy_current", "viscous_magnetisation", "clock_drift", "hysteresis",
     "nonlinearity_cubic", "temperature_offset", "temperature_scale", "temperature_rate",
 )  # fmt: skip
+TURNS = RIVALS[:4]
 
 
 @pytest.mark.parametrize("averaged", [True, False])
@@ -72,6 +73,19 @@ def test_the_time_of_the_mean_is_found_and_taken_off_another_survey(
             attributes, error = applied(found, tmp_path / file, bare)
             assert attributes["not_on_this_survey"] == "averaging"
             assert error < 0.2
+
+
+def test_what_is_late_beside_it_makes_the_array_no_later(tmp_path: Path) -> None:
+    """A filter of each axis would be both at once: late by what nobody measured, for its law to shorten as much."""
+    spread = 0.05**2 / 24.0
+    effects = {"type": "averaging", "spread_s2": [spread] * 4}, {"type": "sampling_lag", "rms_nT": 0.45, "per_axis": True}
+    hand = {"type": "limited_tilt", "duration_s": 400.0, "tilt_deg": 40.0}
+    found = magtensor.close_loop(survey_file(tmp_path, scenario(44, *effects, rate_Hz=10.0, motion=hand)), search=TURNS)
+    adopted = {a["error_model"]: a for a in found.verdict["adopted"]}
+    assert set(adopted) == {"averaging", "sampling_lag"}
+    lags = [c["value"] for c in adopted["sampling_lag"]["coefficients"]]
+    assert abs(np.mean(lags)) < 0.1 * np.std(lags)
+    assert adopted["averaging"]["coefficients"][0]["value"] == pytest.approx(spread, rel=0.05)
 
 
 def applied(found: ClosedLoop, path: Path, true: Simulated) -> tuple[dict[str, Any], float]:

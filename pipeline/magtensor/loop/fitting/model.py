@@ -102,6 +102,9 @@ class Record:
         return x
 
 
+LAW_OF_TURNING = 5e-4  # of the variance of what follows the turning: its law is known to 2 %, in the second order not
+
+
 def regressors(component: Component, x: Excitation, settings: Mapping[str, Any]) -> Terms:
     """An error model's terms on a survey.
 
@@ -115,7 +118,11 @@ def regressors(component: Component, x: Excitation, settings: Mapping[str, Any])
             f"the error model {component.name} gives {type(terms).__name__}; "
             "magtensor.error_models.terms.Terms would be right"
         )
-    return terms if x.noisier is None else replace(terms, noise=_noise_in(terms, component, x.noisier, settings))
+    if x.noisier is not None:
+        terms = replace(terms, noise=_noise_in(terms, component, x.noisier, settings))
+    if "rotation" in component.declared({}).needs:
+        terms = replace(terms, noise=np.maximum(terms.noise, LAW_OF_TURNING))
+    return terms
 
 
 def _noise_in(terms: Terms, component: Component, noisier: Excitation, settings: Mapping[str, Any]) -> Array:
