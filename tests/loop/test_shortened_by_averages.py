@@ -78,7 +78,10 @@ def test_the_time_of_the_mean_is_found_and_taken_off_another_survey(
 def test_what_is_late_beside_it_makes_the_array_no_later(tmp_path: Path) -> None:
     """A filter of each axis would be both at once: late by what nobody measured, for its law to shorten as much."""
     spread = 0.05**2 / 24.0
-    effects = {"type": "averaging", "spread_s2": [spread] * 4}, {"type": "sampling_lag", "rms_nT": 0.45, "per_axis": True}
+    effects = (
+        {"type": "averaging", "spread_s2": [spread] * 4},
+        {"type": "sampling_lag", "rms_nT": 0.45, "per_axis": True},
+    )
     hand = {"type": "limited_tilt", "duration_s": 400.0, "tilt_deg": 40.0}
     found = magtensor.close_loop(survey_file(tmp_path, scenario(44, *effects, rate_Hz=10.0, motion=hand)), search=TURNS)
     adopted = {a["error_model"]: a for a in found.verdict["adopted"]}

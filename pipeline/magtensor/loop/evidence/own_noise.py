@@ -96,10 +96,10 @@ class OwnNoise:
             alone += along.alone
         alone += np.diagonal(normal)[: every.count]
         tested = np.arange(every.count - terms.count, every.count)
-        others = np.setdiff1d(np.arange(size), tested)
+        others = self._free(normal, alone, every.count - terms.count, every.count)
         seen = np.zeros((len(tested), size))
         seen[:, tested] = np.eye(len(tested))
-        seen[:, others] = -normal[np.ix_(tested, others)] @ inverse_of(normal[np.ix_(others, others)])
+        seen -= normal[tested] @ others @ inverse_of(others.T @ normal @ others) @ others.T
         seen = identifiable(seen @ normal @ seen.T, Own(alone[tested], terms.noise_of_each)).T @ seen
         rank = len(seen)
         if not rank:
@@ -114,6 +114,26 @@ class OwnNoise:
         explained = float(found @ inverse @ found)
         share_of_all = min(explained / freedom, 1.0)
         return max(float(betaincc(rank / 2.0, (freedom - rank) / 2.0, share_of_all)), float(chdtrc(rank, explained)))
+
+    def _free(self, normal: Array, alone: Array, given: int, terms: int) -> Array:
+        """(P, q) directions of coefficients (P,) that are free: of the given ones those that the data show, and all of
+        what the fit itself is free in, which comes after the terms.
+
+        Parameters
+        ----------
+        normal: (P, P); alone: (terms,) information of each term, what the fit could do included.
+        """
+        fit = np.arange(terms, len(normal))
+        own = np.zeros((len(normal), len(fit)))
+        own[fit] = np.eye(len(fit))
+        if self.given is None:
+            return own
+        among = normal[:given, fit]
+        left = normal[:given, :given] - among @ inverse_of(normal[np.ix_(fit, fit)]) @ among.T
+        basis = identifiable(left, Own(alone[:given], self.given.noise_of_each))
+        shown = np.zeros((len(normal), basis.shape[1]))
+        shown[:given] = basis
+        return np.hstack([shown, own])
 
     def _of_one_in_the_reference(self, terms: Terms) -> float:
         """The same of a single coefficient that is seen in |b| - F alone, octave by octave, up to the frequencies that

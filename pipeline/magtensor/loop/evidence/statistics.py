@@ -217,14 +217,20 @@ def wald_p(g: Grams, chosen: Sequence[int], alone: Sequence[int] = (), most: int
     count = len(g.zz)
     subset = np.asarray(chosen, dtype=int)
     own = own_information(g)
-    others = np.setdiff1d(np.arange(g.count), [*chosen, *alone])
-    full_n, full_y = _without_others(*normal(g.total()), subset, others, own)
+    free = np.setdiff1d(np.arange(g.count), [*chosen, *alone])
+    every_n, every_y = normal(g.total())
+    others = np.zeros((g.count, len(free)))
+    if len(free):  # in the directions that the data show
+        basis = identifiable(every_n[0][np.ix_(free, free)], own.of(free))
+        others = np.zeros((g.count, basis.shape[1]))
+        others[free] = basis
+    full_n, full_y = _without_others(every_n, every_y, subset, others)
     basis, values = _directions(full_n[0], own.of(subset))
     basis = basis[:, np.argsort(values)[::-1][:most]]
     p = basis.shape[1]
     if p == 0 or p >= count:
         return 1.0
-    n, y = _without_others(*normal(g.without_each()), subset, others, own)
+    n, y = _without_others(*normal(g.without_each()), subset, others)
     basis = _confirmed(basis @ np.linalg.inv(np.linalg.cholesky(basis.T @ full_n[0] @ basis)).T, n)
     p = basis.shape[1]
     if p == 0:
@@ -257,19 +263,15 @@ def _confirmed(basis: Array, n: Array) -> Array:
     return basis @ vt[rank:].T
 
 
-def _without_others(
-    n: Array, y: Array, chosen: NDArray[np.int_], others: NDArray[np.int_], own: Own
-) -> tuple[Array, Array]:
-    """The chosen coefficients' part of a batch of normal equations, the others projected off."""
-    if not len(others):
+def _without_others(n: Array, y: Array, chosen: NDArray[np.int_], others: Array) -> tuple[Array, Array]:
+    """The chosen coefficients' part of a batch of normal equations, the others' directions (P, q) projected off."""
+    if not others.shape[1]:
         return n[:, chosen[:, None], chosen], y[:, chosen]
-    root = own.root
-    n, y = n / np.outer(root, root), y / root
-    inverse = np.linalg.pinv(n[:, others[:, None], others], rcond=1e-8, hermitian=True)
-    mixed = n[:, chosen[:, None], others]
+    inverse = np.linalg.pinv(others.T @ n @ others, rcond=1e-8, hermitian=True)
+    mixed = n[:, chosen] @ others
     n2 = n[:, chosen[:, None], chosen] - mixed @ inverse @ np.swapaxes(mixed, 1, 2)
-    y2 = y[:, chosen] - (mixed @ inverse @ y[:, others, None])[:, :, 0]
-    return n2 * np.outer(root[chosen], root[chosen]), y2 * root[chosen]
+    y2 = y[:, chosen] - (mixed @ inverse @ (y @ others)[:, :, None])[:, :, 0]
+    return n2, y2
 
 
 def cauchy_combination(p_values: Sequence[float]) -> float:
