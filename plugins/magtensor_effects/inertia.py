@@ -85,7 +85,8 @@ def bandwidth(
 
     A filter of time constant tau_s adds -tau_s times its own answer to the output's rate of change; the coefficient
     is the time constant found. To first order that is a delay, so `sampling_lag` is its rival wherever tau_s is short
-    against the motion.
+    against the motion. What all axes have in common is then a rotation of the field and stays zero; how much it is
+    shortened is told by `averaging`.
     """
     return x.responses(-x.sensed(x.relaxed(x.rate, tau_s)), "s")
 
