@@ -14,8 +14,9 @@ from magtensor.error_models.terms import Terms
 from magtensor.loop.evidence.assessment import BORNE_OUT, assess, estimated_in, explained, slow_noise_of
 from magtensor.loop.evidence.grams import Whitened
 from magtensor.loop.evidence.statistics import Gain
-from magtensor.loop.fitting.model import Adopted
-from magtensor.loop.searching.gates import ALPHA, Candidate, adds_to_axes
+from magtensor.loop.fitting.model import Adopted, Fitting
+from magtensor.loop.fitting.refit import joint_state
+from magtensor.loop.searching.gates import ALPHA, SECOND_ORDER, Candidate, adds_to_axes, explained_before, seen_between
 from magtensor.loop.searching.outcome import why
 from magtensor.loop.searching.rounds import with_lines
 from magtensor.loop.searching.screening import candidates_of
@@ -159,3 +160,22 @@ def estimate_p(white: Whitened, terms: Terms) -> float:
     """P value of the terms in noise of the average colour."""
     estimate = estimated_in(white, terms)
     return float(chdtrc(estimate.rank, explained(estimate)))
+
+
+def test_an_error_of_the_reference_leaves_nothing_between_the_sensors() -> None:
+    """A base station that was moved by 300 nT: what drifts on one sensor is no next order of that, and a step of all
+    scale factors may be."""
+    registry = Registry.load()
+    drift = np.zeros((1200, 4, 3))
+    drift[:, 2] = np.linspace(-0.3, 0.3, 1200)[:, None] * np.array([1.0, -1.0, 1.0])
+    record = synthetic(21, noise_nT=0.15, turning_s=4.0, added=drift)
+    assert record.total_field is not None
+    moved = record.total_field + 300.0 * (record.time > 600.0)
+    record = replace(record, total_field=moved, quiet_field=moved)
+    step = Adopted(registry.find("error_model", "reference_step"), {"time_s": 600.5})
+    state = with_lines(joint_state(record, [step], Fitting()), record)
+    (found,) = candidates_of(state, [registry.find("error_model", "offset_drift")], {}, ALPHA)
+    assert found.passes and found.beside == 0.0
+    assert found.assessment.gain.total < SECOND_ORDER * explained_before(state)
+    again = step.terms(state.excitation).at(state.residual.samples)
+    assert not seen_between(state.residual, again, np.ones(1))

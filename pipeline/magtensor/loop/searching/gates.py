@@ -7,10 +7,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from magtensor.calibration.types import Array
 from magtensor.error_models.settings import AnyChannel, profiled
 from magtensor.error_models.terms import REFERENCE, Terms, joined
 from magtensor.loop.evidence.assessment import BORNE_OUT, Assessment
-from magtensor.loop.evidence.residual import taken_off
+from magtensor.loop.evidence.residual import Residual, taken_off
 from magtensor.loop.fitting.model import Adopted, State
 from magtensor.loop.searching.contribution import a_tone, happens_once
 
@@ -178,11 +179,24 @@ def gained_of_a_log(log_noise: float, coefficients: float) -> float:
     return max(LOG_MARGIN * log_noise, log_noise + coefficients + scatter)
 
 
-def explained_before(state: State) -> float:
+def explained_before(state: State, *, between: bool = False) -> float:
     """Sum of squares of the whitened residual that the adopted models explain together to first order.
 
-    Delays, which are taken off to all orders, have no part in it."""
-    return explained_by(state, range(len(state.adopted)))
+    Delays, which are taken off to all orders, have no part in it; nor has the reference, where what is beside it is
+    seen `between` the sensors: they share one.
+    """
+    acting = [i for i, a in enumerate(state.adopted) if not (between and a.component.effect == "reference")]
+    return explained_by(state, acting)
+
+
+def seen_between(residual: Residual, terms: Terms, theta: Array) -> bool:
+    """Whether most of what terms with coefficients (P,) do differs between the sensors."""
+    if residual.across is None or residual.along is None:
+        return residual.along is None
+    none = replace(residual, across=np.zeros_like(residual.across), along=np.zeros_like(residual.along), sighted=None)
+    done = taken_off(none, terms, theta)
+    assert done.across is not None and done.along is not None
+    return float(np.sum(done.across**2)) > float(np.sum(done.along**2))
 
 
 def explained_by(state: State, places: Sequence[int]) -> float:

@@ -18,7 +18,7 @@ from magtensor.error_models.terms import Terms
 from magtensor.loop.evidence.assessment import NEARLY_ALL, Assessment
 from magtensor.loop.fitting.log_noise import channels_of
 from magtensor.loop.fitting.model import Adopted, State
-from magtensor.loop.searching.gates import Candidate, explained_by
+from magtensor.loop.searching.gates import Candidate, explained_by, seen_between
 
 TIME = " time"  # no channel has that name
 
@@ -34,10 +34,13 @@ def explained_by_courses(state: State, candidate: Candidate) -> float:
 
 
 def _explained(state: State, by: set[str], name: str, terms: Terms, assessment: Assessment) -> float:
+    theta = assessment.estimate.theta[-terms.count :]
+    between = seen_between(state.residual, terms, theta)  # where nothing of the reference is
     kin = [
         place
         for place, other in enumerate(state.adopted)
         if other.name != name
+        and not (between and other.component.effect == "reference")
         and by & drivers(other, state.excitation)
         and _held_by(other.sensors or state.excitation.sensors, state, terms, assessment) > NEARLY_ALL
     ]

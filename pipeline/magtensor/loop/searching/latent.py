@@ -119,7 +119,7 @@ def sought(state: State, record: Record, *, may_follow: bool = False) -> Sought 
     objection = left_by = ""
     if not told:
         objection = "with two sensors it cannot be told from a disturbance of one of them"
-    elif n * float(seen @ seen) <= OF_THE_LAW * explained_before(state):
+    elif n * float(seen @ seen) <= OF_THE_LAW * explained_before(state, between=True):
         objection = "it is less than 5 % of what is adopted, whose laws may leave it"
     elif (unseen := of_an_unseen_path(state)) and n * float(seen @ seen) <= explained_by(state, unseen):
         name = state.adopted[unseen[0]].name
