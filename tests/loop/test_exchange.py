@@ -2,11 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
-from loop_cases import BASE, adopted_names, scenario, verdict_of
+from loop_cases import BASE, adopted_names, linear_state, scenario, synthetic, verdict_of
+
+from magtensor.loop.evidence.assessment import assess
+from magtensor.loop.evidence.grams import Whitened
+from magtensor.loop.fitting.model import Adopted, Fitting, State
+from magtensor.loop.fitting.refit import joint_state
+from magtensor.loop.searching.exchange import simpler
+from magtensor.loop.searching.found import Step
+from magtensor.loop.searching.gates import Candidate
+from magtensor.registry import Registry
 
 MODELS = ("site_gradient", "fixed_source", "nonlinearity_cubic")
 LOGGED: dict[str, Any] = {"motion": BASE["motion"] | {"duration_s": 600.0}, "logging": {"attitude": True}}
@@ -35,3 +46,40 @@ def test_a_source_near_the_rig_beside_a_nonlinearity_stays(tmp_path: Path) -> No
     told = verdict_of(tmp_path, scenario(32, *effects, **LOGGED), models=MODELS)
 
     assert adopted_names(told) == {"fixed_source", "nonlinearity_cubic"}
+
+
+@pytest.mark.parametrize(("lag_s", "takes_its_place"), [(60.0, True), (5000.0, False)])
+def test_a_channel_through_a_lag_longer_than_the_survey_is_no_simpler_drift(
+    lag_s: float, takes_its_place: bool
+) -> None:
+    """A drift of the second order, and a temperature that goes its way: through such a lag any does."""
+    registry = Registry.load()
+    time = np.arange(1200) / 1200.0
+    course = time**2
+    rng = np.random.default_rng(3)
+    raw = synthetic(51, noise_nT=0.3, turning_s=4.0).raw
+    drifting = raw * 2e-5 * course[:, None, None] * rng.standard_normal((4, 3))
+    temperature = 20.0 + 10.0 * (course + lag_s * 2.0 * time / 1200.0)  # seen through the lag it is the course
+    record = replace(
+        synthetic(51, noise_nT=0.3, turning_s=4.0, added=drifting), logged={"temperature": temperature},
+        origins={"temperature": np.zeros(())}, units={"temperature": "degC"},
+    )  # fmt: skip
+    state = linear_state(record)
+    drift, other = (registry.find("error_model", name) for name in ("scale_drift", "temperature_scale"))
+    settings = {"order": 1, "channel": "temperature", "lag_s": lag_s, "delayed": False, "at_start": 0.0}
+    first, second = (
+        looked_at(state, Adopted(drift, {"order": 2, "span_s": 1200.0})),
+        looked_at(state, Adopted(other, settings)),
+    )
+    assert first.passes and second.passes
+    adopted = [first.model, Adopted(registry.find("error_model", "cross_field"), {})]
+    after = joint_state(record, adopted, Fitting())
+    found = simpler(after, [Step(state, (first, second), first)], 0)
+    assert (found is not None and found[1].model.name == "temperature_scale") is takes_its_place
+
+
+def looked_at(state: State, model: Adopted) -> Candidate:
+    terms = model.terms(state.excitation).at(state.residual.samples)
+    white = Whitened.of(state.residual, state.colours.across, state.colours.along, state.terms)
+    found = assess(white, terms)
+    return Candidate(model, 1.0, terms, found, found.p, found.own_p, found.null_p)

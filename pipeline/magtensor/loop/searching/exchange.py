@@ -14,6 +14,7 @@ from magtensor.loop.fitting.separation import fold_gain, separated
 from magtensor.loop.searching.contribution import put_back_one, slices
 from magtensor.loop.searching.found import Step
 from magtensor.loop.searching.gates import Candidate
+from magtensor.loop.searching.rivals import hardly_begun
 from magtensor.loop.searching.screening import candidates_of
 
 
@@ -28,7 +29,9 @@ def simpler(state: State, steps: Sequence[Step], fixed: int) -> tuple[int, Candi
             continue
         fewer = (c for c in step.candidates if c.passes and c.terms.count < own.stop - own.start)
         for other in sorted(fewer, key=lambda c: c.terms.count):
-            if other.model.name not in names and not generic(other.model) and _as_good(state, place, other):
+            # what lags by half the survey can be any drift, and is simpler than none
+            known = other.model.name not in names and not hardly_begun(other.model, state.excitation)
+            if known and not generic(other.model) and _as_good(state, place, other):
                 return place, other
     return None
 

@@ -8,7 +8,7 @@ from magtensor.error_models.excitation import Excitation
 from magtensor.error_models.settings import AnyChannel, profiled
 from magtensor.error_models.terms import joined
 from magtensor.loop.evidence.assessment import estimated, explained
-from magtensor.loop.fitting.model import State, generic
+from magtensor.loop.fitting.model import Adopted, State, generic
 from magtensor.loop.fitting.separation import SEPARATION, fold_gain, separated
 from magtensor.loop.searching.beginnings import beginning
 from magtensor.loop.searching.contribution import happens_once
@@ -48,7 +48,7 @@ def simplest(best: Candidate, possible: Sequence[Candidate], state: State) -> tu
     known = {a.name for a in state.adopted}
 
     def complexity(c: Candidate) -> tuple[bool, bool, bool, int, bool, float]:
-        slow, new, once = hardly_begun(c, state.excitation), c.model.name not in known, happens_once(c.model)
+        slow, new, once = hardly_begun(c.model, state.excitation), c.model.name not in known, happens_once(c.model)
         return generic(c.model), slow, new, c.assessment.estimate.rank + begun(c), once, -c.assessment.gain.total
 
     chosen = min((c for c in equal if c is best or c.passes), key=complexity)
@@ -151,11 +151,11 @@ def lasting_instead(chosen: Candidate, possible: Sequence[Candidate]) -> Candida
     return max(better, key=lambda c: c.assessment.gain.total, default=chosen)
 
 
-def hardly_begun(candidate: Candidate, x: Excitation) -> bool:
+def hardly_begun(model: Adopted, x: Excitation) -> bool:
     """Whether a response lags by half the survey or more: what it followed was over before it began, and a channel seen
     through such a lag can be any drift."""
-    found = beginning(candidate.model.component, candidate.model.settings)
-    return found is not None and float(candidate.model.settings[found[1].lag]) > SLOW * x.duration
+    found = beginning(model.component, model.settings)
+    return found is not None and float(model.settings[found[1].lag]) > SLOW * x.duration
 
 
 def _channel(candidate: Candidate) -> str:

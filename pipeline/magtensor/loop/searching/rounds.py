@@ -292,7 +292,8 @@ def _kept(record: Record, before: Trial, chosen: Candidate, how: Fitting) -> tup
     two_channels = chosen.moved is None and channels_of(model, after.state.excitation)
     if not two_channels and already(same, model.component, model.settings):
         return None, ONE_OF_A_KIND
-    slow, channels = hardly_begun(chosen, after.state.excitation), sorted(channels_of(model, after.state.excitation))
+    x = after.state.excitation
+    slow, channels = hardly_begun(chosen.model, x), sorted(channels_of(model, x))
     if (slow or channels) and of_all_alike(after.state, which):
         drift = "drifts" if slow else f"follows {' and '.join(channels)}"
         return None, f"fitted, all sensors show it alike: an error of the base station that {drift} would look the same"
