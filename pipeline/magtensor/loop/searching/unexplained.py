@@ -115,7 +115,8 @@ def noise_words(state: State, record: Record) -> list[str]:
             words.append(f"{slow:.3g} nT rms is not white, {_on_sensors(state)}")
     if (slow := slow_along(state)) > white:
         station = of_the_station(state, record)
-        theirs = f": the base station's own noise makes {station:.2g} nT of it" if TWICE * station > slow else ""
+        makes = "may make all" if station > slow else f"makes {station:.2g} nT"  # known from how its readings scatter
+        theirs = f": the base station's own noise {makes} of it" if TWICE * station > slow else ""
         words.append(f"{slow:.3g} nT rms of |b| - F is not white{theirs}")
     return words
 
