@@ -23,6 +23,7 @@ from magtensor.loop.evidence.residual import Residual
 from magtensor.loop.evidence.turned import TurnedColour
 
 _INNER_RANK = 1e-9
+ENTRIES = 4_000_000  # of the products of all pieces that are held at a time
 
 
 @dataclass(frozen=True)
@@ -50,12 +51,6 @@ class Pieces:
         np.fill_diagonal(same, False)
         first, second = np.nonzero(same)
         return first, second
-
-    def into(self, count: int) -> Array:
-        """(P, R): 1 where a piece belongs to the term."""
-        out = np.zeros((count, len(self.term)))
-        out[self.term, np.arange(len(self.term))] = 1.0
-        return out
 
     @classmethod
     def of(cls, terms: Terms, residual: Residual) -> Pieces:
@@ -313,25 +308,36 @@ def normal(g: Grams) -> tuple[Array, Array]:
     batch = len(g.zz)
     n = np.zeros((batch, g.count, g.count))
     y = np.zeros((batch, g.count))
-    pieces, each = g.pieces, slice(1) if g.one_survey else slice(None)
-    if len(pieces.term) and g.zz.any():
-        solve = np.linalg.solve(g.zz[each], np.concatenate([g.zd, g.ze], axis=2))
-        k = g.dd.shape[1]
-        t = g.dd - np.swapaxes(g.zd, 1, 2) @ solve[:, :, :k]
-        c = g.de - np.swapaxes(g.zd, 1, 2) @ solve[:, :, k:]
-        s = pieces.series
-        parts = t[:, s[:, None], s[None, :]] * pieces.shown
-        into = pieces.into(g.count)
-        n += into @ parts @ into.T
-        y += np.einsum("bro,ro->br", c[:, s], pieces.across) @ into.T
+    if len(g.pieces.term) and g.zz.any():
+        most = max(ENTRIES // len(g.pieces.term) ** 2, 1)
+        for first in range(0, batch, most):
+            _add_across(g, slice(first, first + most), n, y)
     if g.aa.any():
         m = g.own
-        own = _inverse(g.aa[each, :m, :m])
+        own = _inverse((g.aa[:1] if g.one_survey else g.aa)[:, :m, :m])
         mixed = g.aa[:, :m, m:]
         turned = np.swapaxes(mixed, 1, 2) @ own
         n += g.aa[:, m:, m:] - turned @ mixed
         y += g.ar[:, m:] - (turned @ g.ar[:, :m, None])[:, :, 0]
     return n, y
+
+
+def _add_across(g: Grams, sets: slice, n: Array, y: Array) -> None:
+    """Add what some of the sets know across to all normal matrices (B, P, P) and right sides (B, P)."""
+    zd, ze, pieces = g.zd[sets], g.ze[sets], g.pieces
+    solve = np.linalg.solve(g.zz[:1] if g.one_survey else g.zz[sets], np.concatenate([zd, ze], axis=2))
+    k, s = g.dd.shape[1], pieces.series
+    t = g.dd[sets] - np.swapaxes(zd, 1, 2) @ solve[:, :, :k]
+    c = g.de[sets] - np.swapaxes(zd, 1, 2) @ solve[:, :, k:]
+    parts = t[:, s[:, None], s[None, :]] * pieces.shown
+    found = np.einsum("bro,ro->br", c[:, s], pieces.across)
+    starts = np.flatnonzero(np.diff(pieces.term, prepend=-1))  # the pieces are in the order of the terms
+    if len(starts) < len(pieces.term):
+        parts = np.add.reduceat(np.add.reduceat(parts, starts, axis=1), starts, axis=2)
+        found = np.add.reduceat(found, starts, axis=1)
+    own = pieces.term[starts]
+    n[sets, own[:, None], own] += parts
+    y[sets, own] += found
 
 
 def _inverse(information: Array) -> Array:

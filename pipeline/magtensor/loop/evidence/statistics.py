@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -192,14 +193,15 @@ def family_p(g: Grams, sensors: Sequence[str], subset: Sequence[int] | None = No
         if count < LEAST_BLOCKS:
             continue
         part = g if count == finest else g.merged(count)
+        tested = _Jackknife(part)
         if 3 * len(chosen) <= count:
-            found.append(wald_p(part, chosen))
+            found.append(tested.p_value(chosen))
             continue
-        fitting = [wald_p(part, group, alone=chosen) for group in groups if 3 * len(group) <= count]
+        fitting = [tested.p_value(group, alone=chosen) for group in groups if 3 * len(group) <= count]
         if len(fitting) == len(groups) > 1:
             found.append(cauchy_combination(fitting))
     if not found and finest >= LEAST_BLOCKS:
-        found.append(wald_p(g, chosen, most=finest // 3))
+        found.append(_Jackknife(g).p_value(chosen, most=finest // 3))
     return max(found, default=1.0)
 
 
@@ -212,38 +214,61 @@ def wald_p(g: Grams, chosen: Sequence[int], alone: Sequence[int] = (), most: int
         cannot be seen says nothing of one sensor as long as the other sensors' coefficients are free.
     most: directions tested, those with the most information; all if None.
     """
-    from scipy.special import fdtrc
+    return _Jackknife(g).p_value(chosen, alone, most)
 
-    count = len(g.zz)
-    subset = np.asarray(chosen, dtype=int)
-    own = own_information(g)
-    free = np.setdiff1d(np.arange(g.count), [*chosen, *alone])
-    every_n, every_y = normal(g.total())
-    others = np.zeros((g.count, len(free)))
-    if len(free):  # in the directions that the data show
-        basis = identifiable(every_n[0][np.ix_(free, free)], own.of(free))
-        others = np.zeros((g.count, basis.shape[1]))
-        others[free] = basis
-    full_n, full_y = _without_others(every_n, every_y, subset, others)
-    basis, values = _directions(full_n[0], own.of(subset))
-    basis = basis[:, np.argsort(values)[::-1][:most]]
-    p = basis.shape[1]
-    if p == 0 or p >= count:
-        return 1.0
-    n, y = _without_others(*normal(g.without_each()), subset, others)
-    basis = _confirmed(basis @ np.linalg.inv(np.linalg.cholesky(basis.T @ full_n[0] @ basis)).T, n)
-    p = basis.shape[1]
-    if p == 0:
-        return 1.0  # single blocks hold nearly all there is to know: nothing can confirm it
-    theta = np.linalg.solve(basis.T @ full_n[0] @ basis, basis.T @ full_y[0])
-    small, right = basis.T @ n @ basis, y @ basis
-    spread = np.linalg.solve(small, right[:, :, None])[:, :, 0] - theta
-    covariance = (count - 1) / count * spread.T @ spread
-    try:
-        t2 = float(theta @ np.linalg.solve(covariance, theta))
-    except np.linalg.LinAlgError:
-        return 1.0
-    return float(fdtrc(p, count - p, max((count - p) / (p * (count - 1)) * t2, 0.0)))
+
+@dataclass(frozen=True)
+class _Jackknife:
+    """Blocks, each of which is left out in turn."""
+
+    blocks: Grams
+
+    @cached_property
+    def every(self) -> tuple[Array, Array]:
+        """(1, P, P), (1, P) normal equations of all blocks."""
+        return normal(self.blocks.total())
+
+    @cached_property
+    def without_each(self) -> tuple[Array, Array]:
+        """(B, P, P), (B, P) those without each block."""
+        return normal(self.blocks.without_each())
+
+    @cached_property
+    def own(self) -> Own:
+        return own_information(self.blocks)
+
+    def p_value(self, chosen: Sequence[int], alone: Sequence[int] = (), most: int | None = None) -> float:
+        """As `wald_p`."""
+        from scipy.special import fdtrc
+
+        count, terms = len(self.blocks.zz), self.blocks.count
+        subset = np.asarray(chosen, dtype=int)
+        free = np.setdiff1d(np.arange(terms), [*chosen, *alone])
+        others = np.zeros((terms, len(free)))
+        if len(free):  # in the directions that the data show
+            basis = identifiable(self.every[0][0][np.ix_(free, free)], self.own.of(free))
+            others = np.zeros((terms, basis.shape[1]))
+            others[free] = basis
+        full_n, full_y = _without_others(*self.every, subset, others)
+        basis, values = _directions(full_n[0], self.own.of(subset))
+        basis = basis[:, np.argsort(values)[::-1][:most]]
+        p = basis.shape[1]
+        if p == 0 or p >= count:
+            return 1.0
+        n, y = _without_others(*self.without_each, subset, others)
+        basis = _confirmed(basis @ np.linalg.inv(np.linalg.cholesky(basis.T @ full_n[0] @ basis)).T, n)
+        p = basis.shape[1]
+        if p == 0:
+            return 1.0  # single blocks hold nearly all there is to know: nothing can confirm it
+        theta = np.linalg.solve(basis.T @ full_n[0] @ basis, basis.T @ full_y[0])
+        small, right = basis.T @ n @ basis, y @ basis
+        spread = np.linalg.solve(small, right[:, :, None])[:, :, 0] - theta
+        covariance = (count - 1) / count * spread.T @ spread
+        try:
+            t2 = float(theta @ np.linalg.solve(covariance, theta))
+        except np.linalg.LinAlgError:
+            return 1.0
+        return float(fdtrc(p, count - p, max((count - p) / (p * (count - 1)) * t2, 0.0)))
 
 
 def _confirmed(basis: Array, n: Array) -> Array:
