@@ -78,6 +78,7 @@ def test_what_stays_does_not_begin_anew(tmp_path: Path, effect: dict[str, Any], 
     assert "begins_anew" not in done.calibration.apply(bare)["calibrated/b"].attrs
 
 
+@pytest.mark.long
 def test_beside_a_source_that_nobody_logged(tmp_path: Path) -> None:
     """The source's waveform on the other day is found without the drift, which has to be known before."""
     vectors = [[2.7, -1.2, 1.8], [-1.5, 2.4, 0.3], [0.6, 1.5, -2.7], [2.1, -1.8, 0.9]]

@@ -45,9 +45,9 @@ def make_early(channel: str, samples: int) -> Callable[[Path], None]:
     return change
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
-    ("name", "channel", "samples"),
-    [("current_field", "current_heater", 6), pytest.param("channel_response", "wind", 40, marks=pytest.mark.long)],
+    ("name", "channel", "samples"), [("current_field", "current_heater", 6), ("channel_response", "wind", 40)]
 )
 def test_a_delay_is_told_from_a_time_constant(name: str, channel: str, samples: int, tmp_path: Path) -> None:
     survey = scenario(33, {"type": name, "channel": channel, "rms_nT": 3.0})

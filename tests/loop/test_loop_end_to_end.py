@@ -170,6 +170,7 @@ def require_latent_source_alone(found: Verdict) -> None:
     assert found["adopted"][0]["indistinguishable_from"] == []
 
 
+@pytest.mark.long
 def test_a_source_that_nobody_logged_and_that_switches_is_no_step(tmp_path: Path) -> None:
     switched = {"type": "switched", "levels": [-1.0, 1.0], "mean_hold_s": 70.0}
     unlogged = {"type": "latent_source", "nT_per_unit": VECTORS, "waveform_of": switched}
@@ -177,7 +178,7 @@ def test_a_source_that_nobody_logged_and_that_switches_is_no_step(tmp_path: Path
 
 
 @pytest.mark.parametrize("array", [ONE_SENSOR, TWO_SENSORS])
-@pytest.mark.parametrize("rms_nT", [None, 3.0])
+@pytest.mark.parametrize("rms_nT", [pytest.param(None, marks=pytest.mark.long), 3.0])
 def test_few_sensors(tmp_path: Path, array: dict[str, Any], rms_nT: float | None) -> None:
     instrument = scenario()["instrument"] | {"array": array}
     effects = () if rms_nT is None else ({"type": "current_field", "rms_nT": rms_nT, "channel": "current_heater"},)
@@ -250,8 +251,9 @@ def test_verification_is_as_good_as_with_the_effect_declared(tmp_path: Path) -> 
     longer = scenario()["motion"] | {"duration_s": 1800.0}
     survey = survey_file(tmp_path, scenario(8, effect, motion=longer))
     verify = survey_file(tmp_path, scenario(9, effect, motion=longer), "verify.h5")
-    lasting = [f"stages.close_loop.search=[{', '.join(lasting_effects())}]"]
-    run_recipe(RECIPE, tmp_path / "found", survey=survey, verify=verify, overrides=lasting)
+    slow = "temperature_offset, temperature_scale, temperature_rate, offset_drift, scale_drift, warm_up, current_field"
+    searched = [f"stages.close_loop.search=[{slow}]"]
+    run_recipe(RECIPE, tmp_path / "found", survey=survey, verify=verify, overrides=searched)
     recipe = yaml.safe_load(RECIPE.read_text())
     declared = {"temperature_offset": {"channel": "temperature", "lag_s": 100.0}}
     recipe["stages"][recipe["stages"].index("close_loop")] = {"close_loop": {"declared": declared, "search": []}}

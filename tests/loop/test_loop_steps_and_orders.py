@@ -60,7 +60,7 @@ LINE = {"type": "temperature_offset", "lag_s": 100.0}
     [
         ([LINE | {"rms_nT": 0.5}], 1),
         pytest.param([BEND | {"rms_nT": 0.5}], 2, marks=pytest.mark.long),
-        ([LINE | {"rms_nT": 0.4}, BEND | {"rms_nT": 0.4}], 2),
+        pytest.param([LINE | {"rms_nT": 0.4}, BEND | {"rms_nT": 0.4}], 2, marks=pytest.mark.long),
     ],
     ids=["line", "bend", "both"],
 )

@@ -44,6 +44,7 @@ def test_a_gradient_without_attitude_is_no_nonlinearity(tmp_path: Path) -> None:
     assert told["steps"][0]["adopted"] == "nonlinearity_quadratic" and told["steps"][-1]["refused"]  # what it is about
 
 
+@pytest.mark.long
 def test_larger_effects_and_those_that_do_not_follow_the_attitude_are_kept_beside_it(tmp_path: Path) -> None:
     effects = (
         {"type": "nonlinearity_cubic", "rms_nT": 4.0},

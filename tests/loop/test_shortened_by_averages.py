@@ -82,7 +82,7 @@ def test_what_is_late_beside_it_makes_the_array_no_later(tmp_path: Path) -> None
         {"type": "averaging", "spread_s2": [spread] * 4},
         {"type": "sampling_lag", "rms_nT": 0.45, "per_axis": True},
     )
-    hand = {"type": "limited_tilt", "duration_s": 400.0, "tilt_deg": 40.0}
+    hand = {"type": "limited_tilt", "duration_s": 250.0, "tilt_deg": 40.0}
     found = magtensor.close_loop(survey_file(tmp_path, scenario(44, *effects, rate_Hz=10.0, motion=hand)), search=TURNS)
     adopted = {a["error_model"]: a for a in found.verdict["adopted"]}
     assert set(adopted) == {"averaging", "sampling_lag"}
