@@ -12,8 +12,8 @@ from scipy.special import chdtrc, chdtri
 
 from magtensor.error_models.terms import Terms
 from magtensor.loop.evidence.assessment import BORNE_OUT, assess, estimated_in, explained, slow_noise_of
+from magtensor.loop.evidence.gains import Gain
 from magtensor.loop.evidence.grams import Whitened
-from magtensor.loop.evidence.statistics import Gain
 from magtensor.loop.fitting.model import Adopted, Fitting
 from magtensor.loop.fitting.refit import joint_state
 from magtensor.loop.searching.gates import ALPHA, SECOND_ORDER, Candidate, adds_to_axes, explained_before, seen_between

@@ -12,9 +12,10 @@ from scipy.stats import kstest
 from magtensor.error_models.quiet import quieted
 from magtensor.loop.evidence.assessment import block_count, colours_of
 from magtensor.loop.evidence.colour import Colour, colour_of
+from magtensor.loop.evidence.gains import Gain
 from magtensor.loop.evidence.grams import grams
 from magtensor.loop.evidence.spectrum import spectral_lines
-from magtensor.loop.evidence.statistics import Gain, cauchy_combination, family_p, wald_p
+from magtensor.loop.evidence.statistics import cauchy_combination, family_p, wald_p
 from magtensor.loop.fitting.model import Record, State
 from magtensor.loop.fitting.record import CLEARANCE
 from magtensor.loop.searching.gates import ALPHA

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from loop_cases import Array, linear_state, synthetic
 
-from magtensor.loop.evidence.statistics import Gain
+from magtensor.loop.evidence.gains import Gain
 from magtensor.loop.fitting.model import Fitting
 from magtensor.loop.remainder.predictable import predictable_in_the_total_field
 from magtensor.loop.searching.latent import Sought

@@ -11,8 +11,8 @@ from loop_cases import BASE, Array, adopted_names, linear_state, scenario, synth
 
 from magtensor.components import Component
 from magtensor.loop.evidence.assessment import WHITE
+from magtensor.loop.evidence.gains import LEAST_T, focused_folds
 from magtensor.loop.evidence.grams import grams
-from magtensor.loop.evidence.statistics import LEAST_T, focused_folds
 from magtensor.loop.fitting.errors_before_after import folds_for
 from magtensor.loop.fitting.model import Adopted, Fitting, Record
 from magtensor.loop.fitting.refit import joint_state

@@ -10,18 +10,11 @@ import numpy as np
 from magtensor.calibration.types import Array
 from magtensor.error_models.terms import Terms, joined
 from magtensor.loop.evidence.colour import Colour, colour_of
+from magtensor.loop.evidence.gains import Gain, focused_gain, held_out_gain
 from magtensor.loop.evidence.grams import Grams, Whitened, grams, grams_in, normal
 from magtensor.loop.evidence.own_noise import OwnNoise
 from magtensor.loop.evidence.residual import Residual, taken_off
-from magtensor.loop.evidence.statistics import (
-    Estimate,
-    Gain,
-    family_p,
-    focused_gain,
-    held_out_gain,
-    own_information,
-    solve,
-)
+from magtensor.loop.evidence.statistics import Estimate, family_p, own_information, solve
 from magtensor.loop.evidence.turned import TurnedColour, excess_of, excess_of_one
 
 FINEST_BLOCKS = 120

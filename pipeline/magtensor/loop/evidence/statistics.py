@@ -1,27 +1,21 @@
-"""Significance that autocorrelation cannot fake, and held-out gain: the two gates of METHODS A2 steps 3 to 5."""
+"""Significance that autocorrelation cannot fake: the first gate of METHODS A2 steps 3 to 5."""
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from magtensor.calibration.types import Array
-from magtensor.loop.evidence.grams import Grams, held_out, normal
+from magtensor.loop.evidence.grams import Grams, normal
 
 IDENTIFIABLE = 1e-6  # of a regressor's own information: a direction with less left is not estimated
 MOSTLY_NOISE = 2.0  # times the noise in regressors: less is left in a direction of which they show noise above all
 BLOCK_COUNTS = (120, 30, 12)  # long blocks protect against correlation longer than a short block
 LEAST_BLOCKS = 6
-FOLDS = 10
-INTERLEAVED_FOLDS = 20
-LEAST_T = 2.0  # paired t of the held-out gain over folds
-LEAST_SHARE_OF_FOLDS = 0.8  # a strong slow effect gains unevenly, which keeps t low, but nearly everywhere
-CONCENTRATED = 0.9  # of what is known, in one fold: the others do not predict it
 LEAST_LEFT = 1e-3  # of the information in a direction, without any one block
 
 
@@ -101,7 +95,7 @@ def solve(n: Array, y: Array, own: Own) -> Estimate:
     return Estimate(inverse @ y, inverse, n, basis.shape[1])
 
 
-def _theta_of_each(n: Array, y: Array, own: Own) -> Array:
+def theta_of_each(n: Array, y: Array, own: Own) -> Array:
     """(B, P) the coefficients that `solve` gives for each of the normal matrices (B, P, P) and right sides (B, P)."""
     values, vectors, shown = _directions_of_each(n, y, own, np.broadcast_to(own.root, y.shape))
     out: Array = (vectors @ (shown / values)[:, :, None])[:, :, 0] / own.root
@@ -319,152 +313,3 @@ def fisher_combination(p_values: Sequence[float]) -> float:
         return 1.0
     p = np.maximum(np.asarray(p_values, dtype=float), 1e-300)
     return float(chdtrc(2.0 * len(p), -2.0 * np.sum(np.log(p))))
-
-
-@dataclass(frozen=True)
-class Gain:
-    """What terms gain on data their coefficients have not seen.
-
-    Attributes:
-        before, after: (folds,) sums of squared whitened residuals.
-        values: how many values each fold holds.
-    """
-
-    before: Array
-    after: Array
-    values: Array
-
-    @property
-    def total(self) -> float:
-        """Reduction of the sum of squares; twice the log likelihood ratio."""
-        return float(np.sum(self.before - self.after))
-
-    @property
-    def t(self) -> float:
-        """Paired t of the reduction per value over folds."""
-        each = (self.before - self.after) / self.values
-        spread = float(each.std(ddof=1))
-        return float(each.mean() / (spread / np.sqrt(len(each)))) if spread > 0 else 0.0
-
-    def over(self, other: Gain) -> Gain:
-        """What this gains over another on the same folds."""
-        return Gain(other.after, self.after, self.values)
-
-    @property
-    def consistent(self) -> bool:
-        """Whether the gain is there in nearly every fold, or on average by more than its scatter explains."""
-        better = (self.before > self.after).mean()
-        return self.total > 0 and (self.t > LEAST_T or better >= LEAST_SHARE_OF_FOLDS)
-
-    @property
-    def rms(self) -> tuple[float, float]:
-        """Whitened rms before and after."""
-        count = float(self.values.sum())
-        return float(np.sqrt(self.before.sum() / count)), float(np.sqrt(max(self.after.sum(), 0.0) / count))
-
-
-def held_out_gain(g: Grams, freedom: int, blocked: NDArray[np.bool_] | None = None) -> Gain:
-    """Gain over contiguous folds of equal length, a block's gap between training and test.
-
-    Parameters
-    ----------
-    g: the finest blocks.
-    freedom: residual values a sample.
-    blocked: (P,) terms that belong to both models compared.
-    """
-    count = len(g.zz)
-    return _gain_between(g, freedom, np.linspace(0, count, min(FOLDS, count) + 1).round().astype(int), blocked)
-
-
-def focused_gain(g: Grams, freedom: int, blocked: NDArray[np.bool_]) -> Gain | None:
-    """The same over contiguous folds that know equally much of the terms; None where a few blocks know nearly all.
-
-    What acts in one part of a survey only lies in one fold of equal length, and what the others predict of it is one
-    figure.
-    """
-    edges = focused_folds(g, blocked)
-    if len(edges) <= LEAST_BLOCKS:
-        return None
-    gain = _gain_between(g, freedom, edges, blocked)
-    return replace(gain, values=np.full(len(gain.values), gain.values.mean()))  # each fold should gain as much
-
-
-def focused_folds(g: Grams, blocked: NDArray[np.bool_]) -> NDArray[np.int_]:
-    """(folds + 1,) blocks where those folds begin and end: it follows from the terms and not from the data."""
-    known = np.cumsum(_share_of_blocks(g, ~blocked))
-    edges = np.unique(np.searchsorted(known, np.linspace(0.0, 1.0, FOLDS + 1)[1:-1], side="left") + 1)
-    return np.concatenate([[0], edges[edges < len(g.zz)], [len(g.zz)]])
-
-
-def concentrated(g: Grams, blocked: NDArray[np.bool_]) -> bool:
-    """Whether one contiguous fold of equal length holds nearly all that is known of the terms that are not blocked."""
-    share, count = _share_of_blocks(g, ~blocked), len(g.zz)
-    edges = np.linspace(0, count, min(FOLDS, count) + 1).round().astype(int)[:-1]
-    return bool(np.add.reduceat(share, edges).max() > CONCENTRATED)
-
-
-def _share_of_blocks(g: Grams, chosen: NDArray[np.bool_]) -> Array:
-    """(B,) how much of what is known of some terms (P,) each block knows, constants left out; the sum is 1."""
-    info = np.diagonal(g.aa, axis1=1, axis2=2)[:, g.own :].copy()
-    pieces = g.pieces
-    if len(pieces.term) and g.zz.any():
-        own, mixed = g.zz[:, 3, 3], g.zd[:, 3]
-        mean = mixed.sum(axis=0) / own.sum()
-        size = np.diagonal(g.dd, axis1=1, axis2=2) - 2.0 * mean * mixed + mean**2 * own[:, None]
-        np.add.at(info.T, pieces.term, (size[:, pieces.series] * pieces.alone).T)
-    info = np.maximum(info[:, chosen], 0.0)
-    out: Array = (info / np.maximum(info.sum(axis=0), 1e-300)).mean(axis=1)
-    return out
-
-
-def _gain_between(g: Grams, freedom: int, edges: NDArray[np.int_], blocked: NDArray[np.bool_] | None = None) -> Gain:
-    """Gain over folds of the finest blocks between edges."""
-    count, folds = len(g.zz), len(edges) - 1
-    test_masks, train_masks = np.zeros((folds, count), dtype=bool), np.ones((folds, count), dtype=bool)
-    gap = 1 if count >= 4 * folds else 0
-    for k, (a, b) in enumerate(itertools.pairwise(edges)):
-        test_masks[k, a:b] = True
-        train_masks[k, max(a - gap, 0) : b + gap] = False
-    every = np.ones(g.count, dtype=bool)
-    return gain_over(g, freedom, test_masks, train_masks, ~every if blocked is None else blocked, every)
-
-
-def interleaved_gain(g: Grams, freedom: int, before: NDArray[np.bool_], after: NDArray[np.bool_]) -> Gain:
-    """Gain of the terms `after` (P,) over those `before` (P,) on folds of blocks that lie evenly between all others.
-
-    For terms that change slowly over the survey: what they do in a long stretch does not follow from the others.
-    """
-    folds = min(INTERLEAVED_FOLDS, len(g.zz))
-    number = np.arange(len(g.zz)) % folds
-    test_masks = number == np.arange(folds)[:, None]
-    return gain_over(g, freedom, test_masks, ~test_masks, before, after)
-
-
-def gain_over(
-    g: Grams,
-    freedom: int,
-    test_masks: NDArray[np.bool_],
-    train_masks: NDArray[np.bool_],
-    before: NDArray[np.bool_],
-    after: NDArray[np.bool_],
-) -> Gain:
-    """Gain of some terms over others of them.
-
-    Parameters
-    ----------
-    g: the finest blocks.
-    freedom: residual values a sample.
-    test_masks, train_masks: (folds, B) the blocks of each fold.
-    before, after: (P,) terms of the two models compared.
-    """
-    train, test = g.chosen(train_masks), g.chosen(test_masks)
-    n, y = normal(train)
-    own = own_information(g)
-
-    def loss(terms: NDArray[np.bool_]) -> Array:
-        theta, use = np.zeros_like(y), np.flatnonzero(terms)
-        if len(use):
-            theta[:, use] = _theta_of_each(n[:, use[:, None], use], y[:, use], own.of(use))
-        return held_out(train, test, theta)[1]
-
-    return Gain(loss(before), loss(after), test.samples * freedom)

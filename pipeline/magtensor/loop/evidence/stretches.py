@@ -19,8 +19,8 @@ import numpy as np
 from magtensor.calibration.joint import JointFit
 from magtensor.calibration.joint_together import FALSE_REJECTION
 from magtensor.calibration.types import Array, Mask
+from magtensor.loop.evidence.gains import FOLDS
 from magtensor.loop.evidence.residual import residual_of
-from magtensor.loop.evidence.statistics import FOLDS
 
 ABOUT = 25  # samples whose median roughness tells how loud the noise is: a dozen that are disturbed do not
 NEIGHBOURS = 5  # samples of a running median: what lasts for three of them is no spike

@@ -10,8 +10,8 @@ import numpy as np
 from magtensor.error_models.settings import Laws, Orders
 from magtensor.error_models.terms import Terms, joined
 from magtensor.loop.evidence.assessment import Assessment, Colours, block_count
+from magtensor.loop.evidence.gains import Gain, held_out_gain
 from magtensor.loop.evidence.grams import grams
-from magtensor.loop.evidence.statistics import Gain, held_out_gain
 from magtensor.loop.fitting.model import Adopted, State
 
 SEPARATION = 9.0  # twice the log likelihood ratio between two models below which the data do not tell them apart

@@ -18,9 +18,9 @@ from magtensor.error_models.acting import AXES
 from magtensor.error_models.excitation import Excitation
 from magtensor.error_models.terms import Terms, joined
 from magtensor.loop.evidence.assessment import WHITE, Colours
+from magtensor.loop.evidence.gains import Gain, interleaved_gain
 from magtensor.loop.evidence.grams import Whitened, grams_in
 from magtensor.loop.evidence.residual import Residual
-from magtensor.loop.evidence.statistics import Gain, interleaved_gain
 from magtensor.loop.fitting.model import State
 from magtensor.loop.fitting.separation import SEPARATION
 from magtensor.sharing import shared_out

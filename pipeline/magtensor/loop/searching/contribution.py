@@ -14,10 +14,11 @@ from magtensor.error_models.settings import EventTimes, Frequencies, profiled
 from magtensor.error_models.terms import Terms
 from magtensor.error_models.waveform import NAME
 from magtensor.loop.evidence.assessment import WHITE, Colours, block_count, estimated_in, explained
+from magtensor.loop.evidence.gains import Gain, concentrated, focused_gain, held_out_gain
 from magtensor.loop.evidence.grams import Grams, Whitened, grams
 from magtensor.loop.evidence.own_noise import OwnNoise
 from magtensor.loop.evidence.residual import Residual, taken_off
-from magtensor.loop.evidence.statistics import Gain, concentrated, family_p, focused_gain, held_out_gain
+from magtensor.loop.evidence.statistics import family_p
 from magtensor.loop.fitting.model import Adopted, Fitting, Record, State
 from magtensor.loop.fitting.refit import joint_state
 from magtensor.loop.fitting.trial import WORST_RISE, on_the_folds_of, trial

@@ -24,8 +24,8 @@ from magtensor.error_models.waveform import NAME, Course, course_of, free_direct
 from magtensor.loop.evidence.assessment import Assessment, estimated
 from magtensor.loop.evidence.colour import beside_the_field
 from magtensor.loop.evidence.factor import Factors, Groups, noise_alone, refitted, with_factor
+from magtensor.loop.evidence.gains import FOLDS, Gain
 from magtensor.loop.evidence.residual import Residual
-from magtensor.loop.evidence.statistics import FOLDS, Gain
 from magtensor.loop.fitting.log_noise import brought_in
 from magtensor.loop.fitting.model import Adopted, Fitting, Record, State
 from magtensor.loop.fitting.refit import joint_state

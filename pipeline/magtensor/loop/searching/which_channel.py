@@ -9,7 +9,7 @@ from dataclasses import replace
 
 from magtensor.error_models.excitation import Excitation
 from magtensor.error_models.settings import AnyChannel, Orders, profiled
-from magtensor.loop.evidence.statistics import Gain
+from magtensor.loop.evidence.gains import Gain
 from magtensor.loop.fitting.model import State, generic
 from magtensor.loop.fitting.separation import fold_gain, separated
 from magtensor.loop.searching.by_hand import pinned
