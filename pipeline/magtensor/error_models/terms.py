@@ -26,8 +26,8 @@ class Terms:
             an output, numbered 3 * sensor + axis, or REFERENCE; all weights are 1 where none are given.
         delay: (N, K) s by which a unit of the coefficient makes outputs late, of which the series is what that adds to
             first order, of weight 1; None where series are added as they are.
-        noise: (K,) part of the variance of each series that is noise of the outputs, seen in the field; 0 where not
-            given.
+        noise: (K,) part of the variance of each series that says nothing: noise of the outputs, seen in the field, or
+            what a law leaves open; 0 where not given.
     """
 
     names: tuple[str, ...]

@@ -59,7 +59,8 @@ class Own:
 
     Attributes:
         information: (P,) of each before the fit's own freedom was projected off.
-        noise: (P,) part of it that is noise: what noise of the outputs makes of a rate of change, above all.
+        noise: (P,) part of it that says nothing: what noise of the outputs makes of a rate of change, above all, and
+            what the law of a turn leaves open.
     """
 
     information: Array
