@@ -74,7 +74,7 @@ def close_loop(
     from magtensor.loop.evidence.own_noise import OwnNoise
     from magtensor.loop.fitting.errors_before_after import folds_for, held_out_error
     from magtensor.loop.fitting.model import Fitting
-    from magtensor.loop.fitting.refit import with_colour
+    from magtensor.loop.fitting.refit import disturbed, with_colour
     from magtensor.loop.inquiry import inquiry_of
     from magtensor.loop.near_nominal import doubt_of, labelled, settled
     from magtensor.loop.searching.unexplained import unexplained
@@ -137,7 +137,7 @@ def close_loop(
     given["loop/verdict"] = ((), json.dumps(outcome, default=float), {})
     if not last.fit.keep.all():
         doubted = np.zeros(len(survey.time), dtype=bool)
-        doubted[record.samples[~last.fit.keep]] = True
+        doubted[record.samples[disturbed(record, last, how)]] = True
         doubted = survey.made_from(doubted)
         given["good"] = (("time", "sensor"), survey.good_by_sensor & ~doubted[:, None], {"long_name": "may be used"})
         given["flags"] = flag_ranges(

@@ -54,11 +54,11 @@ def test_noise_that_is_louder_for_a_while_is_dated() -> None:
     added = np.zeros((SAMPLES, 4, 3))
     added[1000:1400, 2] = 0.6 * rng.standard_normal((400, 3))
     record = synthetic(3, SAMPLES, turning_s=4.0, noise_nT=0.15, added=added)
-    (words,) = loud_words(linear_state(record), record)
+    (words,) = loud_words(linear_state(record), record, Fitting())
     begin, end = (float(words.split()[i]) for i in (1, 3))
     assert "the noise of S3" in words and begin == pytest.approx(1000, abs=15) and end == pytest.approx(1400, abs=15)
     quiet = synthetic(3, SAMPLES, turning_s=4.0, noise_nT=0.15)
-    assert loud_words(linear_state(quiet), quiet) == []
+    assert loud_words(linear_state(quiet), quiet, Fitting()) == []
 
 
 def beside(difference: Array) -> Record:

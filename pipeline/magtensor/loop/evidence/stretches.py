@@ -6,7 +6,8 @@ Left out as disturbed it would take the evidence for itself along. A spike stand
 What differs from posture to posture (a gain that has jumped) has no neighbours like itself. It is no disturbance where
 it lasts longer than a held-out fold: other folds can confirm it then.
 
-Noise that is louder for a while is no disturbance either. The search does without it, the calibration need not.
+Noise that is louder for a while is no disturbance either. Where it is so loud that all samples together, each counting
+alike, tell less than the quiet ones alone, the calibration does without it.
 """
 
 from __future__ import annotations
@@ -24,6 +25,9 @@ from magtensor.loop.evidence.residual import residual_of
 
 ABOUT = 25  # samples whose median roughness tells how loud the noise is: a dozen that are disturbed do not
 NEIGHBOURS = 5  # samples of a running median: what lasts for three of them is no spike
+LEAST_LOUD = 50  # samples: of fewer nobody knows how loud they are
+LIMITS = 40  # of the loudness, tried
+WORTH_IT = 0.5  # of the variance of a calibration from all samples is left, where some are left out for it
 
 
 def borne_out(fit: JointFit, raw: Array, total_field: Array, reference_noise: float = 0.0) -> Mask:
@@ -43,6 +47,67 @@ def louder(fit: JointFit, raw: Array, total_field: Array, reference_noise: float
     The parameters are those of `borne_out`.
     """
     return louder_in(fit.keep, _parts(fit, raw, total_field, reference_noise))
+
+
+def too_loud(
+    fit: JointFit, raw: Array, total_field: Array, effects: Sequence[Array], reference_noise: float = 0.0
+) -> Mask:
+    """(N,) the samples that a calibration is better without: the noise of most sensors is louder there for a while, by
+    so much that C and o from the others alone have at most `WORTH_IT` of the variance, and no effect a larger one.
+
+    Parameters
+    ----------
+    effects: (N, S, 3) nT, what each of the adopted ones has added; the others as for `borne_out`.
+    """
+    every = residual_of(replace(fit, keep=np.ones_like(fit.keep)), raw, total_field, reference_noise)
+    if every.across is None:
+        return np.zeros(len(raw), dtype=bool)
+    return too_loud_in(every.across, every.affine, [np.sum(e**2, axis=(1, 2)) for e in effects])
+
+
+def too_loud_in(values: Array, affine: Array, effects: Sequence[Array] = ()) -> Mask:
+    """The same of residuals (N, 3 S) across the plane that the sensors share, where the freedom of a fit in each output
+    is affine (N, A).
+
+    With variances v of the samples, which count alike, and M the sum of z z' over those that are used, what is fitted
+    has the covariance M^-1 (sum v z z') M^-1. Judged is the variance that it gives at the attitudes of all samples,
+    without those that are louder than some.
+
+    Parameters
+    ----------
+    effects: (N,) squares of what each effect does at a sample.
+    """
+    from scipy.ndimage import median_filter
+
+    out = np.zeros(len(values), dtype=bool)
+    if len(values) < 4 * LEAST_LOUD:
+        return out
+    rough = np.diff(values, axis=0, prepend=values[:1]) ** 2
+    rough[0] = rough[1]
+    each = median_filter(rough.reshape(len(rough), -1, 3).sum(axis=2), size=(ABOUT, 1), mode="mirror")
+    level = np.median(each / np.maximum(np.median(each, axis=0), 1e-300), axis=1)
+    basis = np.linalg.qr(affine)[0]
+
+    def variance(used: Mask) -> float:
+        z = basis[used]
+        try:
+            made = np.linalg.inv(z.T @ z)
+        except np.linalg.LinAlgError:
+            return np.inf
+        return float(np.trace(made @ (z.T * level[used]) @ z @ made))
+
+    limits = np.quantile(level, np.arange(1, LIMITS + 1) / LIMITS)
+    found = [variance(level <= limit) for limit in limits]
+    best = int(np.argmin(found))
+    if not found[best] <= WORTH_IT * found[-1]:
+        return out
+    loud = median_filter((level > limits[best]).astype(int), size=ABOUT, mode="nearest")
+    for first, end in np.flatnonzero(np.diff(loud, prepend=0, append=0)).reshape(-1, 2):
+        out[first:end] = end - first >= LEAST_LOUD
+    for square in effects:
+        if level[~out] @ square[~out] * square.sum() ** 2 > level @ square * square[~out].sum() ** 2:
+            return np.zeros_like(out)
+    return out
 
 
 def louder_in(keep: Mask, parts: Sequence[tuple[int, Array]]) -> Mask:

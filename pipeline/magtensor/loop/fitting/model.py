@@ -227,6 +227,7 @@ class Fitting:
         searching: samples beyond all noise are believed where their neighbours agree (`stretches`), for an effect may
             yet explain them; otherwise where the noise is louder than elsewhere.
         nominal: what is assumed of the sensors where the attitudes do not determine them; None where they do.
+        without: s, from when to when the noise is so loud that the calibration is better without these samples.
     """
 
     reference_noise: float = 0.0
@@ -235,3 +236,11 @@ class Fitting:
     complete: bool = False
     searching: bool = True
     nominal: Nominal | None = None
+    without: tuple[tuple[float, float], ...] = ()
+
+    def among(self, time: Array) -> NDArray[np.bool_]:
+        """(N,) the samples at these times (N,) s that are not too loud."""
+        out = np.ones(len(time), dtype=bool)
+        for begin, until in self.without:
+            out &= (time < begin) | (time > until)
+        return out

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from magtensor.calibration import joint
 from magtensor.calibration.coverage import Coverage
-from magtensor.calibration.joint import JointFit, fit_joint
+from magtensor.calibration.joint import JointFit, fit_recording
 from magtensor.calibration.nominal import fit_nominal
+from magtensor.calibration.recording import InMemory
 from magtensor.calibration.types import Array
 from magtensor.error_models.delays import cleared
 from magtensor.error_models.excitation import Excitation
@@ -21,7 +22,7 @@ from magtensor.errors import NotEnoughData
 from magtensor.loop.evidence.assessment import Colours, colours_of, estimated, log_likelihood
 from magtensor.loop.evidence.residual import Residual, quick, residual_of, taken_off
 from magtensor.loop.evidence.statistics import Estimate
-from magtensor.loop.evidence.stretches import borne_out, louder
+from magtensor.loop.evidence.stretches import borne_out, louder, too_loud
 from magtensor.loop.fitting.model import Adopted, Fitting, Record, State
 from magtensor.loop.fitting.seen import beside_the_site, excitation_of
 
@@ -164,6 +165,7 @@ def _fit(
 ) -> JointFit:
     assert reference is not None and record.total_field is not None and record.quiet_field is not None
     loud = record.total_field - record.quiet_field
+    usable = how.among(record.time) if how.without else None
 
     def fitted(believed: NDArray[np.bool_] | None) -> JointFit:
         options: dict[str, Any] = {
@@ -171,7 +173,7 @@ def _fit(
             "worst_error": how.worst_error if how.complete else _SLACK * how.worst_error,
         }  # fmt: skip
         if how.nominal is None:
-            return fit_joint(raw, reference, known=known, **options)
+            return fit_recording(InMemory(raw, reference, usable), known=known, **options)
         return fit_nominal(raw, reference, how.nominal, quiet_field=reference - loud, start=start, **options)
 
     try:
@@ -183,7 +185,31 @@ def _fit(
     if keep is not None or fit.keep.all():
         return fit
     more = (borne_out if how.searching else louder)(fit, raw, reference, how.reference_noise)
+    more = more if usable is None else more & usable
     return fit if np.array_equal(more, fit.keep) else fitted(more)
+
+
+def loud_stretches(record: Record, state: State, how: Fitting) -> tuple[tuple[float, float], ...]:
+    """s, from when to when the noise is so loud that the calibration is better without these samples."""
+    each = [a.terms(state.excitation) for a in state.adopted]
+    raw, reference = without(record, each, state.theta)
+    assert reference is not None
+    effects = [
+        without(record, [terms], [-theta])[0] - record.raw for terms, theta in zip(each, state.theta, strict=True)
+    ]
+    loud = too_loud(state.fit, raw, reference, effects, how.reference_noise)
+    edges = np.flatnonzero(np.diff(loud.astype(int), prepend=0, append=0)).reshape(-1, 2)
+    return tuple((float(record.time[first]), float(record.time[end - 1])) for first, end in edges)
+
+
+def disturbed(record: Record, state: State, how: Fitting) -> NDArray[np.bool_]:
+    """(N,) samples that neither the calibration nor noise explains, be it as loud as it is there."""
+    out = ~np.asarray(state.fit.keep)
+    if not how.without or not out.any():
+        return out
+    raw, reference = without(record, [a.terms(state.excitation) for a in state.adopted], state.theta)
+    assert reference is not None
+    return out & (how.among(record.time) | ~louder(state.fit, raw, reference, how.reference_noise))
 
 
 def reweighed(record: Record, state: State, how: Fitting) -> State:

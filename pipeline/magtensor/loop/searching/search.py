@@ -16,7 +16,7 @@ from magtensor.error_models.excitation import Excitation
 from magtensor.error_models.needs import missing
 from magtensor.errors import DataError
 from magtensor.loop.fitting.model import Adopted, Fitting, Record, State, of_the_site
-from magtensor.loop.fitting.refit import joint_state
+from magtensor.loop.fitting.refit import joint_state, loud_stretches
 from magtensor.loop.fitting.trial import on_the_folds_of, trial
 from magtensor.loop.fitting.wandering import all_noise, narrowed_to, of_sensors, quieter, unweighed
 from magtensor.loop.searching.adopting import on_those_that_show
@@ -61,7 +61,7 @@ def search(
             _require_channels(joint_state(record, sources, how).excitation, declared)
     first = joint_state(record, declared, how)
     rounds = Rounds(models, len(declared), most_effects, alpha, lines, say)
-    ended = rounds.run(record, first, how)
+    ended = _without_what_is_loud(rounds.run(record, first, how), rounds)
     if how.nominal is None and len(ended.state.adopted) - len(declared) < most_effects:
         ended = _without_those_that_wander(ended, rounds)
     record, state, how, steps = ended.record, ended.state, ended.how, ended.steps
@@ -94,6 +94,23 @@ def search(
             evenly=unweighed(record, last, how),
         )  # fmt: skip
     return found
+
+
+def _without_what_is_loud(ended: Ended, rounds: Rounds) -> Ended:
+    """The search gone on without the samples whose noise is so much louder than that of the others that these are
+    better off alone; as it ended where there are none, or where what was adopted is shown there only."""
+    if ended.how.nominal is not None:
+        return ended
+    loud = loud_stretches(ended.record, ended.state, ended.how)
+    if not loud:
+        return ended
+    how = replace(ended.how, without=loud)
+    try:
+        state = joint_state(ended.record, ended.state.adopted, how, ended.state.theta, ended.state.lines)
+    except DataError:  # the others do not determine a calibration by themselves
+        return ended
+    again = rounds.run(ended.record, state, how)
+    return replace(again, steps=(*ended.steps, *again.steps))
 
 
 def _without_those_that_wander(ended: Ended, rounds: Rounds) -> Ended:

@@ -8,15 +8,18 @@ sensor whose matrix is not constant, or an error model that is significant and w
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from magtensor.loop.evidence.assessment import assess
 from magtensor.loop.evidence.own_noise import OwnNoise
+from magtensor.loop.evidence.residual import residual_of
 from magtensor.loop.evidence.spectrum import spectral_lines
-from magtensor.loop.evidence.stretches import ABOUT
-from magtensor.loop.fitting.model import Record, State
+from magtensor.loop.evidence.stretches import ABOUT, LEAST_LOUD
+from magtensor.loop.fitting.model import Fitting, Record, State
+from magtensor.loop.fitting.refit import disturbed, without
 from magtensor.loop.remainder.changing_matrix import changing_matrices
 from magtensor.loop.remainder.flagged import beyond_the_reference, flagged_words, lasting
 from magtensor.loop.remainder.gradient_shape import MODEL, gradient_share
@@ -33,7 +36,6 @@ OF_A_LINE = 0.1  # of the square of what is left above the noise: less than that
 MUCH = 3.0  # times the white noise of an output: no base station beside a site differs by so much unnoticed
 TWICE = 2.0  # what the slow noise of the sensors, known from few frequencies, makes of it
 LOUD = 2.0  # times the usual noise
-LEAST_LOUD = 50  # samples
 NOISE = "what is left is noise: white, and slow noise of each sensor alone or of the reference"
 
 
@@ -43,7 +45,7 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
     excess = excess_rms(state)
     last = found.steps[-1].candidates if found.steps else ()
     seen = [c for c in last if c.passes or unlikely(c)]
-    flagged = lasting(~state.fit.keep, beyond_the_reference(state, record))
+    flagged = lasting(disturbed(record, state, found.how), beyond_the_reference(state, record))
     if flagged.any():  # while effects were sought, what lasts was believed
         seen = [c for c in seen if _still_significant(c, state)]
     suspects = [c for c in seen if not (c.of_the_log or c.of_second_order or c.of_the_law)]
@@ -86,7 +88,7 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
     if words:
         size = f"{excess:.3g} nT rms above the white noise, {_on_sensors(state)}"
         words.insert(0, size if excess else "in sum no more than the white noise")
-    beside = loud_words(state, record)
+    beside = loud_words(state, record, found.how)
     if flagged.any():
         left_out, noise = flagged_words(flagged, state, record)
         (beside if noise else words).append(left_out)
@@ -137,13 +139,18 @@ def slow_along(state: State) -> float:
     return max(float(np.mean((residual.along**2 - 1.0) / residual.reference_gain**2)), 0.0) ** 0.5
 
 
-def loud_words(state: State, record: Record) -> list[str]:
+def loud_words(state: State, record: Record, how: Fitting) -> list[str]:
     """Where the noise of a sensor is louder for a while: no effect, but worth a look."""
     from scipy.ndimage import median_filter
 
-    residual = state.residual
-    if residual.across is None or len(residual.across) < 4 * LEAST_LOUD:
+    if state.residual.across is None or len(state.residual.across) < 4 * LEAST_LOUD:
         return []
+    seen = state.residual
+    if how.without:
+        raw, reference = without(record, [a.terms(state.excitation) for a in state.adopted], state.theta)
+        believed = state.fit.keep | ~how.among(record.time)
+        seen = residual_of(replace(state.fit, keep=believed), raw, reference, how.reference_noise)
+    assert seen.across is not None
     names = state.excitation.sensors
     pairs = (
         [(" and ".join(names), slice(None))]
@@ -154,7 +161,7 @@ def loud_words(state: State, record: Record) -> list[str]:
     )
     words = []
     for name, own in pairs:
-        rough = np.sum(np.diff(residual.across[:, own], axis=0) ** 2, axis=1)
+        rough = np.sum(np.diff(seen.across[:, own], axis=0) ** 2, axis=1)
         rough = median_filter(rough, size=ABOUT, mode="mirror")
         usual = float(np.median(rough))
         loud = rough > LOUD**2 * usual
@@ -163,11 +170,17 @@ def loud_words(state: State, record: Record) -> list[str]:
         if not found:
             continue
         first, end = max(found, key=lambda stretch: stretch[1] - stretch[0])
-        begin, until = (record.time[residual.samples[i]] - record.start for i in (first, end))
+        begin, until = (record.time[seen.samples[i]] - record.start for i in (first, end))
         times = float(np.sqrt(np.median(rough[first:end]) / usual))
         others = f", and in {len(found) - 1} shorter stretches" if len(found) > 1 else ""
         words.append(
             f"from {begin:.5g} to {until:.5g} s the noise of {name} is {times:.2g} times as loud as usual{others}"
+        )
+    if how.without:
+        count = int(np.sum(~how.among(record.time)))
+        words.append(
+            f"{count} samples in which most sensors are so loud have no part in the calibration, which is better "
+            "without them"
         )
     return words
 
