@@ -11,7 +11,7 @@ from scipy.stats import kstest
 
 from magtensor.error_models.quiet import quieted
 from magtensor.loop.evidence.assessment import block_count, colours_of
-from magtensor.loop.evidence.colour import Colour, colour_of
+from magtensor.loop.evidence.colour import Colour, colour_of, likeliest_mixture
 from magtensor.loop.evidence.gains import Gain
 from magtensor.loop.evidence.grams import grams
 from magtensor.loop.evidence.spectrum import spectral_lines
@@ -51,6 +51,30 @@ def test_the_filter_keeps_white_noise_as_it_is() -> None:
     colour = colour_of(series)
     assert colour.white == pytest.approx(9.0, rel=0.05)
     assert colour.power is None or colour.power.max() < 2.0
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_the_likeliest_law_is_found_however_far_a_trend_stands_above_all_else(seed: int) -> None:
+    """Against multiplicative updates, each of which lowers the same sum (Fevotte, Bertin and Durrieu 2009)."""
+    rng = np.random.default_rng(seed)
+    f = np.geomspace(1e-4, 0.5, 50)
+    count = np.maximum(1.0, 2000.0 * f)
+    corners = np.geomspace(1e-4, 0.1, 12)
+    shapes = np.column_stack([np.ones(50), *(1.0 / (1.0 + (f / corner) ** 2) for corner in corners)])
+    true = 1.0 + (3e-3 / f) + 1e5 * (rng.uniform(0.5, 2.0) * 1e-4 / f) ** rng.choice([2.0, 4.0])
+    level = true * rng.chisquare(count) / count
+
+    def unlikely(model: Array) -> float:
+        return float(np.sum(count * (np.log(model) + level / model)))
+
+    weights, model = likeliest_mixture(level, count, shapes)
+    np.testing.assert_allclose(model, shapes @ weights)
+    assert (weights >= 0.0).all()
+    slowly = np.full(13, level.mean() / 13)
+    for _ in range(20_000):
+        now = shapes @ slowly
+        slowly *= np.sqrt((shapes.T @ (count * level / now**2)) / (shapes.T @ (count / now)))
+    assert unlikely(model) < unlikely(shapes @ slowly) + 0.1
 
 
 def test_combined_probability() -> None:
