@@ -9,9 +9,10 @@ import pytest
 from loop_cases import Array, linear_state, synthetic
 from scipy.stats import kstest
 
+from magtensor.calibration.mixture import likeliest_mixture
 from magtensor.error_models.quiet import quieted
 from magtensor.loop.evidence.assessment import block_count, colours_of
-from magtensor.loop.evidence.colour import Colour, colour_of, likeliest_mixture
+from magtensor.loop.evidence.colour import Colour, colour_of
 from magtensor.loop.evidence.gains import Gain
 from magtensor.loop.evidence.grams import grams
 from magtensor.loop.evidence.spectrum import spectral_lines

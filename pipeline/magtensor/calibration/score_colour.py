@@ -27,6 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .blocks import BlockScores
+from .mixture import likeliest_mixture
 from .types import Array
 
 FALSE_ALARM = 0.01  # of fits in white noise are widened
@@ -257,8 +258,6 @@ def _is_coloured(spectrum: Array, freedom: float, level: float) -> bool:
 def fitted_spectrum(spectrum: Array, freedom: float) -> tuple[Array, float]:
     """White noise, 1/f, 1/f^2 and relaxations fitted to ordinates j = 1, 2, ...: their sum there (M,), and the variance
     that it gives the mean over the recording, where white noise of unit power gives one."""
-    from scipy.optimize import nnls
-
     count = len(spectrum)
     half_waves = np.arange(1, count + 1)
     corners = 2.0 ** np.arange(0, int(np.log2(count)))
@@ -270,9 +269,5 @@ def fitted_spectrum(spectrum: Array, freedom: float) -> tuple[Array, float]:
     edges = np.unique(np.round(np.geomspace(1, count + 1, 24)).astype(int)) - 1
     level = np.array([spectrum[a:b].mean() for a, b in pairwise(edges)])
     mean_shapes = np.array([shapes[a:b].mean(axis=0) for a, b in pairwise(edges)])
-    model = np.full(len(level), float(spectrum.mean()))
-    for _ in range(6):  # chi-square weights from the fitted level itself
-        weight = np.sqrt(freedom * np.diff(edges) / 2.0) / np.maximum(model, 1e-3 * spectrum.mean())
-        found, _ = nnls(mean_shapes * weight[:, None], level * weight)
-        model = mean_shapes @ found
+    found, _ = likeliest_mixture(level, freedom * np.diff(edges), mean_shapes)
     return np.maximum(shapes @ found, 1e-3 * spectrum.mean()), float(at_zero @ found)

@@ -15,6 +15,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from magtensor.calibration.mixture import likeliest_mixture
 from magtensor.calibration.types import Array
 
 _COLUMNS = 16  # filtered at a time
@@ -22,9 +23,6 @@ _SHORT = np.array([1.0, 3.0, 10.0])  # time constants in samples
 _LEAST = 64  # samples, of fewer the noise is taken for white
 _LEAST_OF_SHORT = 100  # of them in a survey, or it is not short
 _LEAST_LEFT = 1e-3  # frequencies' worth of noise, where a series was taken off them
-_MOST_STEPS = 30  # of the likeliest law; a few are enough but where a trend stands far above all else
-_SHARES = 0.5 ** np.arange(8)  # of a step, tried in this order
-_RESTS = 0.02  # twice the log likelihood that a last step gains
 _SETTLING = 3  # rounds in which a colour and what goes with the field settle
 
 
@@ -111,43 +109,6 @@ def colour_of(
     if relative[1] < 1.05:
         return Colour(None, white)
     return Colour(relative, white)
-
-
-def likeliest_mixture(level: Array, count: Array, shapes: Array) -> tuple[Array, Array]:
-    """(Q,) the weights, none of them negative, of spectral shapes (M, Q) that make mean squares (M,) of so many values
-    each likeliest; and the spectrum (M,) that they make.
-
-    By Fisher's scoring, each step a least-squares fit with the variances of the spectrum before it. Where a trend
-    stands far above all else whole steps go in circles; a part of one always leads to what is likelier.
-    """
-    from scipy.optimize import nnls
-
-    def fitted(about: Array) -> Array:
-        weight = np.sqrt(count / 2.0) / np.maximum(about, 1e-300)
-        return np.asarray(nnls(shapes * weight[:, None], level * weight, maxiter=100 * shapes.shape[1])[0])
-
-    def modelled(weights: Array) -> Array:
-        return np.maximum(shapes @ weights, 1e-12 * level.max())
-
-    def unlikely(model: Array) -> float:
-        return float(np.sum(count * (np.log(model) + level / model)))
-
-    here = fitted(level)
-    model = modelled(here)
-    now = unlikely(model)
-    for _ in range(_MOST_STEPS):
-        step = fitted(model) - here
-        for share in _SHARES:
-            there = modelled(here + share * step)
-            after = unlikely(there)
-            if after < now:
-                break
-        else:
-            break
-        gained, here, model, now = now - after, here + share * step, there, after
-        if gained < _RESTS:
-            break
-    return here, model
 
 
 def _white(columns: Array, share: float) -> Colour:
