@@ -125,8 +125,10 @@ def close_loop(
     if doubt is not None:
         outcome["calibration"] = doubt.facts()
     clean = cleaned(survey, calibration, last.adopted, last.theta, record.origins)
+    believed = np.zeros(len(survey.time), dtype=bool)
+    believed[record.samples[last.fit.keep]] = True
     given = common_frame(clean, calibration, "joint") | effect_variables(
-        last.adopted, last.theta, record.origins, survey
+        last.adopted, last.theta, record.origins, survey, believed
     )
     given |= errors | slow
     before_fit = np.linalg.norm(survey.values("b_raw"), axis=2) - survey.values("total_field")[:, None]

@@ -12,12 +12,17 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
-from loop_cases import scenario, survey_file
+from loop_cases import RECIPE, scenario, survey_file
 from numpy.typing import NDArray
 
 import magtensor
 from magtensor.cli import status_of
 from magtensor.closed_loop import ClosedLoop
+from magtensor.loop.correcting.stored import effect_variables
+from magtensor.loop.fitting.model import Adopted
+from magtensor.preparing import load_as
+from magtensor.recipe.plan import read_plan
+from magtensor.registry import Registry
 from magtensor.standing_out import REASON, standing_out
 
 MOTION = scenario()["motion"] | {"duration_s": 600.0}
@@ -93,6 +98,21 @@ def test_an_effect_beyond_what_the_calibration_has_seen_is_told(
             assert ("extrapolated" in file["calibrated/b"].attrs) is bool(said)
     beyond = re.search(r"current_heater goes ([\d.]+) A beyond what the calibration has seen", out)
     assert beyond is not None and float(beyond[1]) > 2.0
+
+
+def test_what_had_no_part_in_the_calibration_was_not_seen_by_it(folder: Path) -> None:
+    path = folder / "heated.h5"
+    survey = load_as(read_plan(RECIPE, survey=path), path)
+    current = np.asarray(survey.values("current_heater"))
+    model = Adopted(Registry.load().find("error_model", "current_field"), {"channel": "current_heater", "lag_s": 0.0})
+
+    def seen(believed: NDArray[np.bool_] | None) -> list[float]:
+        stored = effect_variables([model], [np.zeros(12)], {"current_heater": np.zeros(1)}, survey, believed)
+        ranges: dict[str, list[float]] = json.loads(stored["calibration/effects"][2]["channel_ranges"])
+        return ranges["current_heater"]
+
+    assert seen(None) == [current.min(), current.max()]
+    assert seen(current < 0.5) == [current.min(), current[current < 0.5].max()]
 
 
 def test_spikes_of_another_survey_are_flagged(tmp_path: Path, folder: Path, plain: ClosedLoop) -> None:

@@ -73,6 +73,7 @@ def test_a_field_that_the_base_station_does_not_see_is_no_noise() -> None:
     railway = np.repeat(rng.choice([0.0, 0.8, 2.0, -1.0], SAMPLES // 30), 30)
     found = told(beside(railway - railway.mean()))
     assert found["present"] and "in all sensors alike" in str(found["description"])
+    assert "above the white noise, mostly in |b| - F, alike in all sensors" in str(found["description"])
 
 
 def test_a_base_station_that_wanders_a_little_is() -> None:

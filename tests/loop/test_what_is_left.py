@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
-from loop_cases import Array, linear_state, synthetic
+from loop_cases import Array, adopted_names, linear_state, scenario, synthetic, verdict_of
 
 from magtensor.loop.evidence.gains import Gain
 from magtensor.loop.fitting.model import Fitting
@@ -59,3 +60,15 @@ def test_a_small_waveform_that_predicts_nothing_is_not_told(share: float, told: 
     )  # fmt: skip
     assert shared.significant and not shared.gain.consistent
     assert unexplained(replace(found, shared=shared), record)["present"] is told
+
+
+def test_what_the_law_of_something_far_larger_may_miss_is_told_as_that(tmp_path: Path) -> None:
+    """A base station that reads too little by 0.6 nT, beside an offset that jumps by some hundred."""
+    step = {"type": "offset_step", "rms_nT": 300.0, "time_s": [500.0]}
+    scale = {"type": "reference_scale", "rms_nT": 0.6}
+    told = verdict_of(tmp_path, scenario(91, step, scale), models=["offset_step", "reference_scale"])
+    assert adopted_names(told) == {"offset_step"}
+    assert (
+        "significant, but less than 0.3% of the size of what is adopted, whose law may miss as much: reference_scale"
+        in told["unexplained"]["description"]
+    )

@@ -9,6 +9,7 @@ from datetime import datetime, timedelta
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from magtensor.calibration.types import Array, ArrayCalibration
 from magtensor.error_models.needs import FACTS
@@ -28,9 +29,17 @@ MOST_BEYOND = 0.25  # of the range that a calibration has seen of a channel
 
 
 def effect_variables(
-    adopted: Sequence[Adopted], theta: Sequence[Array], origins: Mapping[str, Array], survey: Survey
+    adopted: Sequence[Adopted],
+    theta: Sequence[Array],
+    origins: Mapping[str, Array],
+    survey: Survey,
+    believed: NDArray[np.bool_] | None = None,
 ) -> dict[str, Variable]:
-    """The effects found on a survey as a variable of the group `calibration`; nothing where there are none."""
+    """The effects found on a survey as a variable of the group `calibration`; nothing where there are none.
+
+    Args:
+        believed: (N,) the samples that the effects were fitted to; all that may be used if None.
+    """
     if not adopted:
         return {}
     texts = [
@@ -48,7 +57,7 @@ def effect_variables(
     ]
     attributes = {"channel_origins": json.dumps({k: np.asarray(v).tolist() for k, v in origins.items()})}
     attributes["start"] = started(survey).isoformat()
-    attributes["channel_ranges"] = json.dumps(_ranges(record_of(survey, origins)))
+    attributes["channel_ranges"] = json.dumps(_ranges(record_of(survey, origins, use=believed)))
     return {"calibration/effects": (("effect",), np.array(texts, dtype=np.str_), attributes)}
 
 

@@ -28,7 +28,7 @@ from magtensor.loop.remainder.predictable import attitude_words, converter_words
 from magtensor.loop.remainder.tones import of_the_turning
 from magtensor.loop.searching.contribution import happens_once
 from magtensor.loop.searching.found import Search
-from magtensor.loop.searching.gates import Candidate
+from magtensor.loop.searching.gates import SECOND_ORDER, Candidate
 from magtensor.loop.searching.latent import shared_words
 
 ALPHA = 0.001  # of each of the tests
@@ -86,9 +86,14 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
             + (f": {MODEL}, which cannot be tested without {lacks}, would look like this" if lacks else "")
         )
     if words:
-        size = f"{excess:.3g} nT rms above the white noise, {_on_sensors(state)}"
+        size = f"{excess:.3g} nT rms above the white noise, {_where(state)}"
         words.insert(0, size if excess else "in sum no more than the white noise")
     beside = loud_words(state, record, found.how)
+    if small := [c.model.name for c in seen if c.of_second_order]:
+        beside.append(
+            f"significant, but less than {SECOND_ORDER**0.5:.1%} of the size of what is adopted, whose law may miss as "
+            f"much: {', '.join(small)}"
+        )
     if flagged.any():
         left_out, noise = flagged_words(flagged, state, record)
         (beside if noise else words).append(left_out)
@@ -205,6 +210,18 @@ def strongest_line(state: State, record: Record) -> tuple[float, float] | None:
     """Frequency in Hz and rms in nT of a spectral line that noise does not make; None without one."""
     lines = spectral_lines(state.residual, record.time[state.residual.samples])
     return (lines[0][0], lines[0][1]) if lines and lines[0][2] < ALPHA else None
+
+
+def _where(state: State) -> str:
+    """Words for where most of what is left is."""
+    residual = state.residual
+    if residual.across is None or residual.along is None:
+        return _on_sensors(state)
+    count = len(residual.along)
+    between = float(np.sum(residual.across**2)) - count * (residual.freedom - 1)
+    if float(np.sum(residual.along**2)) - count > max(between, 0.0):
+        return "mostly in |b| - F, alike in all sensors"
+    return _on_sensors(state)
 
 
 def _on_sensors(state: State) -> str:
