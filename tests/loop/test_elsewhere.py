@@ -7,6 +7,7 @@ import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import h5py
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 import magtensor
 from magtensor.cli import status_of
 from magtensor.closed_loop import ClosedLoop
-from magtensor.loop.correcting.stored import effect_variables
+from magtensor.loop.correcting.stored import effect_variables, extrapolated
 from magtensor.loop.fitting.model import Adopted
 from magtensor.preparing import load_as
 from magtensor.recipe.plan import read_plan
@@ -113,6 +114,23 @@ def test_what_had_no_part_in_the_calibration_was_not_seen_by_it(folder: Path) ->
 
     assert seen(None) == [current.min(), current.max()]
     assert seen(current < 0.5) == [current.min(), current[current < 0.5].max()]
+
+
+@pytest.mark.parametrize(("warmer", "told"), [(False, False), (True, True)])
+def test_a_channel_is_judged_as_it_is_seen_through_the_lag(folder: Path, warmer: bool, told: bool) -> None:
+    """Through a lag far longer than the survey a temperature stays near its first value: another first value within
+    what the thermometer has shown is far outside what has acted."""
+    path = folder / "clean.h5"
+    survey = load_as(read_plan(RECIPE, survey=path), path)
+    temperature = np.asarray(survey.values("temperature"))
+    component = Registry.load().find("error_model", "temperature_offset")
+    model = Adopted(component, {"channel": "temperature", "lag_s": 20_000.0, "order": 1, "at_start": 0.0})
+    stored = effect_variables([model], [np.zeros(12)], {"temperature": np.zeros(1)}, survey)
+    calibration: Any = {"calibration/effects": SimpleNamespace(attrs=stored["calibration/effects"][2])}
+    first = temperature[0] + (0.9 * (temperature.max() - temperature[0]) if warmer else 0.0)
+    other = survey.merged({"temperature": (("time",), np.full_like(temperature, first), {"units": "degC"})})
+    said = extrapolated(other, calibration, [model], {"temperature": np.zeros(1)})
+    assert ("temperature, through a lag of 2e+04 s, goes" in said) is told and bool(said) is told
 
 
 def test_spikes_of_another_survey_are_flagged(tmp_path: Path, folder: Path, plain: ClosedLoop) -> None:

@@ -179,3 +179,18 @@ def test_an_error_of_the_reference_leaves_nothing_between_the_sensors() -> None:
     assert found.assessment.gain.total < SECOND_ORDER * explained_before(state)
     again = step.terms(state.excitation).at(state.residual.samples)
     assert not seen_between(state.residual, again, np.ones(1))
+
+
+@pytest.mark.parametrize(("of_sensor", "may"), [(2, False), (0, True)])
+def test_an_effect_of_one_sensor_leaves_nothing_in_the_others(of_sensor: int, may: bool) -> None:
+    """S1 jumps by 300 nT: what drifts on another sensor is no next order of that, what drifts on S1 may be."""
+    registry = Registry.load()
+    added = np.zeros((1200, 4, 3))
+    added[601:, 0] += 300.0
+    added[:, of_sensor] += np.linspace(-0.3, 0.3, 1200)[:, None] * np.array([1.0, -1.0, 1.0])
+    record = synthetic(22, noise_nT=0.15, turning_s=4.0, added=added)
+    step = Adopted(registry.find("error_model", "offset_step"), {"time_s": 600.5}, ("S1",))
+    state = with_lines(joint_state(record, [step], Fitting()), record)
+    (found,) = candidates_of(state, [registry.find("error_model", "offset_drift")], {}, ALPHA)
+    assert (found.beside > 0.0) is may and found.passes is not may
+    assert found.assessment.gain.total < SECOND_ORDER * explained_before(state)

@@ -69,6 +69,6 @@ def test_what_the_law_of_something_far_larger_may_miss_is_told_as_that(tmp_path:
     told = verdict_of(tmp_path, scenario(91, step, scale), models=["offset_step", "reference_scale"])
     assert adopted_names(told) == {"offset_step"}
     assert (
-        "significant, but less than 0.3% of the size of what is adopted, whose law may miss as much: reference_scale"
+        "reference_scale: significant, and less than 0.3% of the size of what is adopted, whose law may miss as much"
         in told["unexplained"]["description"]
     )

@@ -21,6 +21,7 @@ from .types import Array, Mask
 LEAST_SAMPLES_PER_AXIS = 20  # below this the noise is taken as equal on all axes of the array
 LEAST_SHARE = 0.05  # of its sensor's mean noise variance: a smaller estimate is a Heywood case, not a quiet axis
 QUIETEST = 1e-4  # the same of a sensor among all: noise levels differ by factors of 30, and one of zero weighs all
+NOISELESS = 1e-9  # of the outputs: less noise is the rounding of what was computed, and no sensor's
 _ALIKE = 0.98  # cosine of the largest angle between two planes
 _CHUNK = 65536
 
@@ -108,6 +109,7 @@ def output_noise(raw: Array, keep: Mask | None = None, run: NDArray[np.int_] | N
     ------
     MissingAttitudes: as in `common_field`.
     """
+    least = NOISELESS * float(np.sqrt(np.mean(raw**2)))
     among = None if keep is None else keep[:-2] & keep[1:-1] & keep[2:]
     if run is not None:
         within = run[2:] == run[:-2]
@@ -119,8 +121,8 @@ def output_noise(raw: Array, keep: Mask | None = None, run: NDArray[np.int_] | N
     own, outputs = np.linalg.qr(found.noise[:, None] * found.basis)[0], _widest(raw if keep is None else raw[keep])
     if np.linalg.svd(own.T @ outputs)[1].min() < _ALIKE:
         moves = second if among is None else second[among]
-        return _with_noise(_factor(moves)[1], len(moves), outputs)[0].reshape(raw.shape[1], 3)
-    return found.noise.reshape(raw.shape[1], 3)
+        return np.maximum(_with_noise(_factor(moves)[1], len(moves), outputs)[0].reshape(raw.shape[1], 3), least)
+    return np.maximum(found.noise.reshape(raw.shape[1], 3), least)
 
 
 def _widest(raw: Array) -> Array:

@@ -57,7 +57,7 @@ def effect_variables(
     ]
     attributes = {"channel_origins": json.dumps({k: np.asarray(v).tolist() for k, v in origins.items()})}
     attributes["start"] = started(survey).isoformat()
-    attributes["channel_ranges"] = json.dumps(_ranges(record_of(survey, origins, use=believed)))
+    attributes["channel_ranges"] = json.dumps(_ranges(record_of(survey, origins, use=believed), adopted))
     return {"calibration/effects": (("effect",), np.array(texts, dtype=np.str_), attributes)}
 
 
@@ -247,9 +247,13 @@ def _lacking(effect: Adopted, record: Record) -> str:
     return ""
 
 
-def _ranges(record: Record) -> dict[str, list[float]]:
-    """Least and largest value of each channel, its origin taken off; those of several columns together."""
-    return {name: [float(v.min()), float(v.max())] for name, v in record.logged.items()}
+def _ranges(record: Record, adopted: Sequence[Adopted]) -> dict[str, list[float]]:
+    """Least and largest value of each channel, its origin taken off, and of those that effects see through a lag; those
+    of several columns together."""
+    out = {name: [float(v.min()), float(v.max())] for name, v in record.logged.items()}
+    for effect in adopted:
+        out |= {what: [float(v.min()), float(v.max())] for what, _, v in _followed(effect, record)}
+    return out
 
 
 def extrapolated(survey: Survey, calibration: Survey, adopted: Sequence[Adopted], origins: Mapping[str, Array]) -> str:
@@ -258,24 +262,34 @@ def extrapolated(survey: Survey, calibration: Survey, adopted: Sequence[Adopted]
     if known is None or not survey.good.any():
         return ""
     seen, record = json.loads(str(known)), record_of(survey, origins, use=survey.good)
-    now, words = _ranges(record), []
+    words = []
     for effect in (a for a in adopted if a.component.effect != "site"):  # what belongs to a site is not taken off
-        for channel in _followed(effect, record):
-            if channel not in seen or channel not in now:
+        for what, channel, values in _followed(effect, record):
+            if what not in seen:  # of 2026: channels alone
+                what, values = channel, record.logged[channel]
+            if what not in seen:
                 continue
-            low, high = seen[channel]
-            beyond = max(low - now[channel][0], now[channel][1] - high)
+            low, high = seen[what]
+            beyond = max(low - float(values.min()), float(values.max()) - high)
             if beyond > MOST_BEYOND * (high - low):
                 units = f" {record.units[channel]}" if record.units[channel] else ""
-                words.append(f"{effect.name}: {channel} goes {beyond:.3g}{units} beyond what the calibration has seen")
+                words.append(f"{effect.name}: {what} goes {beyond:.3g}{units} beyond what the calibration has seen")
     return "; ".join(dict.fromkeys(words))
 
 
-def _followed(effect: Adopted, record: Record) -> list[str]:
-    """The channels that an effect follows."""
+def _followed(effect: Adopted, record: Record) -> list[tuple[str, str, Array]]:
+    """What an effect follows: in words, the channel, and its values, seen through the effect's lag from equilibrium."""
     x = record.excitation(record.raw, record.raw)
-    marks = {n: m for n, m in profiled(effect.component).items() if isinstance(m, AnyChannel)}
-    return [str(effect.settings.get(n, "")) or (mark.values(x) or [""])[0] for n, mark in marks.items()]
+    lag = float(effect.settings.get("lag_s", 0.0))
+    out = []
+    for name, mark in profiled(effect.component).items():
+        if isinstance(mark, AnyChannel):
+            channel = str(effect.settings.get(name, "")) or (mark.values(x) or [""])[0]
+            if channel in record.logged:
+                late = lag > 0.0 and not effect.settings.get("delayed", False)
+                values = x.lagged(x.channel(channel), lag) if late else x.channel(channel)
+                out.append((f"{channel}, through a lag of {lag:.4g} s," if late else channel, channel, values))
+    return out
 
 
 def left_in(survey: Survey, adopted: Sequence[Adopted]) -> str:

@@ -20,6 +20,7 @@ from magtensor.loop.evidence.scoring import rarity
 
 Groups = Sequence[NDArray[np.int_]]
 REACHED = 0.1  # singular value, relative, of a direction of covariances that noise of small correlation can reach
+ROUNDING = 1e-9  # of the mean variance, that every direction has
 _ITERATIONS = 400
 
 
@@ -59,6 +60,7 @@ def noise_alone(covariance: Array, basis: Array, groups: Groups) -> Factors:
     basis: (n, m) orthonormal, N of z = N' n.
     groups: the outputs of each group.
     """
+    covariance = _definite(covariance)
     level = np.sqrt(np.trace(covariance) / len(covariance))
     return _fitted(covariance, basis, groups, level * np.eye(len(basis)), None)
 
@@ -69,6 +71,7 @@ def with_factor(covariance: Array, basis: Array, groups: Groups, alone: Factors)
     The better of two maxima: from the noise as it is without a factor, and from a factor of all that the strongest
     direction has above the others. A strong factor is in the noise without it, and the search does not come back.
     """
+    covariance = _definite(covariance)
     values, vectors = np.linalg.eigh(alone.covariance)
     values = np.maximum(values, 1e-9 * values[-1])
     root, inverse = vectors * np.sqrt(values) @ vectors.T, vectors / np.sqrt(values) @ vectors.T
@@ -87,9 +90,16 @@ def with_factor(covariance: Array, basis: Array, groups: Groups, alone: Factors)
 
 def refitted(covariance: Array, basis: Array, groups: Groups, near: Factors) -> Factors:
     """The same model as that of a covariance nearby, from where that was found."""
+    covariance = _definite(covariance)
     noise = near.noise + 1e-9 * np.trace(near.noise) / len(basis) * np.eye(len(basis))
     direction = near.direction if near.direction.any() else None
     return _fitted(covariance, basis, groups, np.linalg.cholesky(noise), direction)
+
+
+def _definite(covariance: Array) -> Array:
+    """A covariance (m, m) with a trace of noise in every direction: outputs that were computed may have none."""
+    out: Array = covariance + ROUNDING * np.trace(covariance) / len(covariance) * np.eye(len(covariance))
+    return out
 
 
 def _fitted(covariance: Array, basis: Array, groups: Groups, start: Array, direction: Array | None) -> Factors:

@@ -24,6 +24,7 @@ from magtensor.error_models.terms import Terms
 from magtensor.loop.evidence.turned import SlowModes
 
 LONG = 4000  # samples, from which on a transform of an awkward length takes long
+NOISELESS = 1e-4  # mean square of what is left between sensors: none has so little noise, and rounding says nothing
 _INNER_RANK = 1e-9  # of the largest singular value
 
 
@@ -69,7 +70,8 @@ class Residual:
     """The residual of N samples and its tangent space.
 
     Attributes:
-        across: (N, 3 S) whitened, perpendicular to the plane; None for a single sensor.
+        across: (N, 3 S) whitened, perpendicular to the plane; None for a single sensor, and where outputs that were
+            computed without noise leave nothing between the sensors.
         along: (N,) whitened; None without a total field.
         unit: nT, the mean field; affine: (N, A) (b, 1), b in that unit: the fit's own freedom across; A is 4, more
             where surveys have constants of their own.
@@ -194,6 +196,8 @@ def residual_of(fit: JointFit, raw: Array, total_field: Array | None, reference_
     if total_field is not None:  # of the length that is known: a sample's own noise along u is the residual itself
         seen_along = np.column_stack([u * (total_field[keep] / unit)[:, None], affine[:, 3]])
     across = plane.residual(used) if size > 3 else None
+    if across is not None and np.mean(across**2) < NOISELESS:
+        across = None
     along = None if total_field is None else (length - total_field[keep]) / spread
     if fit.posterior is not None:
         # the prior holds C and o where the residual is not the least there is

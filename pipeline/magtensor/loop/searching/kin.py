@@ -20,7 +20,23 @@ from magtensor.loop.fitting.log_noise import channels_of
 from magtensor.loop.fitting.model import Adopted, State
 from magtensor.loop.searching.gates import Candidate, explained_by, seen_between
 
+MOST = 0.5  # of what a candidate explains
 TIME = " time"  # no channel has that name
+
+
+def explained_beside(state: State, terms: Terms, assessment: Assessment) -> float:
+    """Sum of squares that the adopted models explain whose next order may be all that a candidate shows: not of the
+    reference what differs between the sensors, nor of some sensors what others show."""
+    between = seen_between(state.residual, terms, assessment.estimate.theta[-terms.count :])
+    return explained_by(
+        state,
+        [
+            place
+            for place, other in enumerate(state.adopted)
+            if not (between and other.component.effect == "reference")
+            and (not other.sensors or _held_by(other.sensors, state, terms, assessment) > MOST)
+        ],
+    )
 
 
 def explained_by_kin(state: State, model: Adopted, terms: Terms, assessment: Assessment) -> float:

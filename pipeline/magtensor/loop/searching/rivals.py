@@ -28,8 +28,9 @@ def simplest(best: Candidate, possible: Sequence[Candidate], state: State) -> tu
     that needs none it is told apart by the likelihood of all of them.
 
     Simplest is more of what was adopted already, with another setting; then what has the fewest coefficients, what it
-    began with among them, and of those what lasts; a response that lags by half the survey or longer comes after both.
-    A model that slow noise could explain is named, and not chosen before one that it could not.
+    began with among them, and of those what lasts. A response that no model names comes after these, and one that lags
+    by half the survey or longer after all: a channel seen through such a lag is whatever it should be. A model that
+    slow noise could explain is named, and not chosen before one that it could not.
     """
     colours = best.assessment.colours
     reference = fold_gain(best.before or state, colours, best.terms)
@@ -49,7 +50,7 @@ def simplest(best: Candidate, possible: Sequence[Candidate], state: State) -> tu
 
     def complexity(c: Candidate) -> tuple[bool, bool, bool, int, bool, float]:
         slow, new, once = hardly_begun(c.model, state.excitation), c.model.name not in known, happens_once(c.model)
-        return generic(c.model), slow, new, c.assessment.estimate.rank + begun(c), once, -c.assessment.gain.total
+        return slow, generic(c.model), new, c.assessment.estimate.rank + begun(c), once, -c.assessment.gain.total
 
     chosen = min((c for c in equal if c is best or c.passes), key=complexity)
     chosen = lasting_instead(chosen, possible)

@@ -20,8 +20,8 @@ from magtensor.loop.fitting.log_noise import brought_in, channels_of
 from magtensor.loop.fitting.model import Adopted, State, generic
 from magtensor.loop.fitting.separation import Assessed, lowest, plainer
 from magtensor.loop.searching.contribution import happens_once
-from magtensor.loop.searching.gates import Candidate, explained_before, seen_between
-from magtensor.loop.searching.kin import explained_by_kin
+from magtensor.loop.searching.gates import Candidate
+from magtensor.loop.searching.kin import explained_beside, explained_by_kin
 from magtensor.loop.searching.profiling import (
     REFINING_SAMPLES,
     SCREENING_SAMPLES,
@@ -50,11 +50,10 @@ def candidates_of(state: State, models: Sequence[Component], failed: dict[str, s
     adjusted = _holm([a.p * tried for _, tried, _, a in found], len(names))
     own = _holm([a.own_p * tried for _, tried, _, a in found], len(names))
     null = _holm([a.null_p * tried for _, tried, _, a in found], len(names))
-    beside = {between: explained_before(state, between=between) for between in (False, True)}
     candidates = [
         Candidate(
             model, tried, terms, assessment, p, own_p, null_p, alpha, _log_noise(state, model, terms, assessment),
-            beside[seen_between(state.residual, terms, assessment.estimate.theta[-terms.count :])],
+            explained_beside(state, terms, assessment),
             explained_by_kin(state, model, terms, assessment),
         )
         for (model, tried, terms, assessment), p, own_p, null_p in zip(found, adjusted, own, null, strict=True)

@@ -23,7 +23,8 @@ from magtensor.loop.fitting.log_noise import brought_in, channels_of
 from magtensor.loop.fitting.model import Adopted, State
 from magtensor.loop.searching.beginnings import beginning
 from magtensor.loop.searching.contribution import put_back_one
-from magtensor.loop.searching.gates import Candidate, explained_before, seen_between
+from magtensor.loop.searching.gates import Candidate
+from magtensor.loop.searching.kin import explained_beside
 from magtensor.loop.searching.profiling import (
     LEAST_RATIO,
     REFINING_SAMPLES,
@@ -126,8 +127,7 @@ def _assessed(state: State, place: int, name: str, pair: tuple[float, float], al
     now = Whitened.of(state.residual, state.colours.across, state.colours.along, state.terms)
     assessment = assess(now, both)
     log_noise = brought_in(state, channels_of(model, state.excitation))
-    between = seen_between(state.residual, both, assessment.estimate.theta[-both.count :])
     return Candidate(
         other, tried, both, assessment, assessment.p * tried, assessment.own_p * tried, assessment.null_p * tried,
-        alpha, log_noise, explained_before(state, between=between), moved=(place, one),
+        alpha, log_noise, explained_beside(state, both, assessment), moved=(place, one),
     )  # fmt: skip

@@ -91,8 +91,8 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
     beside = loud_words(state, record, found.how)
     if small := [c.model.name for c in seen if c.of_second_order]:
         beside.append(
-            f"significant, but less than {SECOND_ORDER**0.5:.1%} of the size of what is adopted, whose law may miss as "
-            f"much: {', '.join(small)}"
+            f"{' and '.join(small)}: significant, and less than {SECOND_ORDER**0.5:.1%} of the size of what is "
+            "adopted, whose law may miss as much"
         )
     if flagged.any():
         left_out, noise = flagged_words(flagged, state, record)

@@ -1,0 +1,43 @@
+"""A channel that is seen through a lag of more than half the survey may be any course of time."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from loop_cases import linear_state, synthetic
+
+from magtensor.error_models import first_order
+from magtensor.loop.searching.gates import ALPHA
+from magtensor.loop.searching.rivals import hardly_begun, simplest
+from magtensor.loop.searching.rounds import with_lines
+from magtensor.loop.searching.screening import candidates_of
+from magtensor.registry import Registry
+
+SAMPLES = 600
+
+
+def test_what_follows_another_channel_at_once_comes_first() -> None:
+    """Scale factors that follow the humidity, beside a thermometer that shows the same through a lag of three surveys:
+    the named cause is a rival, and no better known."""
+    time = np.arange(SAMPLES, dtype=float)
+    temperature = 2.0 * np.sin(time / 110.0) + 0.004 * time
+    humidity = first_order.straight(time, temperature, 3.0 * SAMPLES)
+    humidity = (humidity - humidity.mean()) / humidity.std()
+    added = np.zeros((SAMPLES, 4, 3))
+    bare = synthetic(5, SAMPLES, noise_nT=0.15, turning_s=4.0)
+    added += 3e-5 * humidity[:, None, None] * bare.raw * np.array([1.0, -1.0, 1.0])
+    logged = {"temperature": temperature - temperature.mean(), "rel_hum": humidity}
+    record = replace(
+        synthetic(5, SAMPLES, noise_nT=0.15, turning_s=4.0, added=added),
+        logged=logged, units={"temperature": "degC", "rel_hum": "%"}, origins=dict.fromkeys(logged, np.zeros(1)),
+    )  # fmt: skip
+    state = with_lines(linear_state(record), record)
+    registry = Registry.load()
+    models = [registry.find("error_model", name) for name in ("temperature_scale", "channel_response")]
+    found = {c.model.name: c for c in candidates_of(state, models, {}, ALPHA)}
+    named, generic = found["temperature_scale"], found["channel_response"]
+    assert hardly_begun(named.model, state.excitation) and generic.model.settings["channel"] == "rel_hum"
+    for best in (named, generic):
+        chosen, others = simplest(best, [named, generic], state)
+        assert chosen is generic and others == ("temperature_scale",)
