@@ -43,6 +43,7 @@ def candidates(record: Record) -> list[Candidate]:
     return candidates_of(with_lines(linear_state(record), record), models, {}, ALPHA)
 
 
+@pytest.mark.long
 def test_a_base_station_that_wanders_has_no_events() -> None:
     """In noise of 1/f and 1/f^2 some of its bumps would be impossible; in noise of its own spectrum none is."""
     impossible = 0

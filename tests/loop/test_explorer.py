@@ -66,6 +66,7 @@ def test_look_adopt_look_again_undo(explorer: Explorer) -> None:
         explorer.undo()
 
 
+@pytest.mark.long
 def test_the_result_says_who_did_what_and_can_be_made_again(tmp_path: Path, explorer: Explorer, survey: Path) -> None:
     explorer.reject("channel_response")
     explorer.adopt("offset_drift", order=1)

@@ -78,7 +78,7 @@ EFFECTS: list[Any] = [
     ("current_field", {"rms_nT": 5.0, "channel": "current_heater"}, True),
     pytest.param("nonlinearity_quadratic", {"rms_nT": 1.0}, False, marks=pytest.mark.long),
     pytest.param("scale_drift", {"rms_nT": 1.0}, False, marks=pytest.mark.long),
-    ("reference_scale", {"excess": 0.3}, False),
+    pytest.param("reference_scale", {"excess": 0.3}, False, marks=pytest.mark.long),
 ]  # temperature_offset and sampling_lag have tests of their own
 
 
@@ -126,6 +126,7 @@ BESIDE_A_SOURCE = ("latent_source", "offset_step", "offset_drift", "temperature_
 VECTORS = [[0.9, -0.4, 0.6], [-0.5, 0.8, 0.1], [0.2, 0.5, -0.9], [0.7, -0.6, 0.3]]
 
 
+@pytest.mark.long
 def test_a_source_that_nobody_logged_is_found_and_taken_off_another_survey(tmp_path: Path) -> None:
     unlogged = {"type": "latent_source", "nT_per_unit": VECTORS, "waveform_of": SLOW}
     told = {"type": "channel_response", "channel": "hidden", "reference": 0.0, "nT_per_unit": VECTORS}

@@ -14,7 +14,9 @@ STATION = {"rate_Hz": 2.0, "noise_sd_nT": 0.0}
 MODELS = ["temperature_offset", "nonlinearity_quadratic", "offset_drift", "latent_source"]
 
 
-@pytest.mark.parametrize("effect", [None, "temperature_offset", "nonlinearity_quadratic"])
+@pytest.mark.parametrize(
+    "effect", [None, "temperature_offset", pytest.param("nonlinearity_quadratic", marks=pytest.mark.long)]
+)
 def test_what_is_there_is_found_and_nothing_is_made_of_rounding(effect: str | None, tmp_path: Path) -> None:
     effects: list[dict[str, Any]] = [] if effect is None else [{"type": effect, "rms_nT": 5.0}]
     told = verdict_of(tmp_path, scenario(3, *effects, instrument=INSTRUMENT, base_station=STATION), models=MODELS)

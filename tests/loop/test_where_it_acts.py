@@ -100,6 +100,7 @@ def test_the_folds_of_the_third_gate_divide_what_happens_once() -> None:
     assert nearest[0] + nearest[-1] == pytest.approx(2000, abs=3)  # it is as long coming as it is going
 
 
+@pytest.mark.long
 def test_a_vehicle_that_passed_is_found_wherever_the_folds_lie(tmp_path: Path) -> None:
     track = {"closest_m": [9.0, 0.0, -1.0], "velocity_m_s": [0.0, 0.6, 0.0]}
     passing = {"type": "passing_source", "rms_nT": 0.6, "time_s": 610.0} | track

@@ -315,6 +315,7 @@ def test_equal_errors_before_and_after_are_one_column(whole_survey: Survey, writ
     assert "verification survey" in text and "declared model" not in text
 
 
+@pytest.mark.long
 def test_many_samples_of_a_dozen_sensors_stay_small(tmp_path: Path) -> None:
     survey = made.calibrated_survey(30_000, tuple(f"S{k}" for k in range(14)))
     path = write_report(made.save(tmp_path, survey))
