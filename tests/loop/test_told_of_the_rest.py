@@ -9,10 +9,13 @@ import numpy as np
 import pytest
 from loop_cases import Array, linear_state, synthetic
 
-from magtensor.loop.fitting.model import Fitting, Record
+from magtensor.loop.fitting.model import Adopted, Fitting, Record
+from magtensor.loop.fitting.refit import joint_state
+from magtensor.loop.remainder.flagged import flagged_words
 from magtensor.loop.remainder.predictable import converter_words
 from magtensor.loop.searching.found import Search
 from magtensor.loop.searching.unexplained import loud_words, unexplained
+from magtensor.registry import Registry
 from magtensor.verdict import sentence
 
 SAMPLES = 3000
@@ -59,6 +62,31 @@ def test_noise_that_is_louder_for_a_while_is_dated() -> None:
     assert "the noise of S3" in words and begin == pytest.approx(1000, abs=15) and end == pytest.approx(1400, abs=15)
     quiet = synthetic(3, SAMPLES, turning_s=4.0, noise_nT=0.15)
     assert loud_words(linear_state(quiet), quiet, Fitting()) == []
+
+
+@pytest.mark.parametrize(
+    ("where", "told_of"),
+    [
+        ("largest", "where current_heater is largest"),
+        ("smallest", "where current_heater is smallest"),
+        ("anywhere", ""),
+    ],
+)
+def test_flagged_samples_at_an_end_of_a_channel_are_told_as_such(where: str, told_of: str) -> None:
+    """A current whose field saturates: the largest currents fit no straight line."""
+    rng = np.random.default_rng(11)
+    current = rng.normal(0.0, 1.0, SAMPLES)
+    added = 3.0 * current[:, None, None] * rng.normal(0.0, 1.0, (4, 3))
+    record = replace(
+        synthetic(11, SAMPLES, turning_s=4.0, noise_nT=0.15, added=added),
+        logged={"current_heater": current}, units={"current_heater": "A"}, origins={"current_heater": np.zeros(1)},
+    )  # fmt: skip
+    model = Adopted(Registry.load().find("error_model", "current_field"), {"channel": "current_heater", "lag_s": 0.0})
+    state = joint_state(record, [model], Fitting())
+    by = {"largest": -current, "smallest": current, "anywhere": rng.standard_normal(SAMPLES)}[where]
+    flagged = np.isin(np.arange(SAMPLES), np.argsort(by)[:40])
+    words, _ = flagged_words(flagged, state, record)
+    assert told_of in words and ("mostly where" in words) is bool(told_of)
 
 
 def beside(difference: Array) -> Record:

@@ -9,11 +9,14 @@ import numpy as np
 from magtensor.calibration.types import Mask
 from magtensor.loop.evidence.own_noise import OwnNoise
 from magtensor.loop.evidence.residual import residual_of
+from magtensor.loop.fitting.log_noise import channels_of
 from magtensor.loop.fitting.model import Record, State
 from magtensor.loop.fitting.refit import without
 
 LONGEST_SPIKE = 2  # samples: what lasts longer is no accident of the recording
 UNCOVERED = 2.0  # steps between samples
+ALIKE = 0.1  # of the mean square along the field, across it: an effect on each sensor shows as much in both
+AT_AN_END = 0.95  # of the other samples have smaller, or larger, values on average
 FAR = 3.0  # times the rms of slow noise: where it wanders furthest it stays for a while
 
 
@@ -55,7 +58,8 @@ def flagged_words(flagged: Mask, state: State, record: Record) -> tuple[str, boo
     if every.along is not None and shared > own.max():
         amount = float(np.sqrt(np.mean((every.along[flagged] / every.reference_gain[flagged]) ** 2)))
         usual = OwnNoise(state.residual, None).slow_along()
-        where = " of |b| - F" + ("" if every.across is None else ", in all sensors alike")
+        alike = every.across is not None and own.max() < ALIKE * shared
+        where = " of |b| - F" + (", in all sensors alike" if alike else "")
     else:
         worst = int(np.argmax(own))
         amount = float(np.sqrt(own[worst] * np.mean(every.noise[3 * worst : 3 * worst + 3] ** 2)))
@@ -66,7 +70,25 @@ def flagged_words(flagged: Mask, state: State, record: Record) -> tuple[str, boo
     words = (
         f"{int(flagged.sum())} samples in {stretches} ({after[0]:.4g} to {after[-1]:.4g} s after the start) fit no "
         f"calibration, by {amount:.3g} nT rms{where}: they are flagged and have no part in the calibration"
+        f"{_at_an_end(flagged, state, record)}"
     )
     if amount > FAR * usual:
         return words, False
     return f"{words}; slow noise, of {usual:.3g} nT rms there, may go as far", True
+
+
+def _at_an_end(flagged: Mask, state: State, record: Record) -> str:
+    """In words, the channel that an adopted effect follows and that is at its largest or smallest in flagged samples:
+    there the law of the effect may be another one."""
+    kept = ~flagged
+    for channel in sorted({c for model in state.adopted for c in channels_of(model, state.excitation)}):
+        values = record.logged[channel].reshape(len(flagged), -1)
+        if values.shape[1] != 1 or not kept.any():
+            continue
+        usual = np.sort(values[kept, 0])
+        ranks = [np.searchsorted(usual, values[flagged, 0], side) for side in ("left", "right")]
+        above = float(np.mean(ranks)) / len(usual)
+        if max(above, 1.0 - above) > AT_AN_END:
+            end = "largest" if above > AT_AN_END else "smallest"
+            return f", mostly where {channel} is {end}: what follows it may not go on there as it was fitted"
+    return ""
