@@ -24,7 +24,9 @@ from magtensor.error_models.terms import Terms
 from magtensor.loop.evidence.turned import SlowModes
 
 LONG = 4000  # samples, from which on a transform of an awkward length takes long
-NOISELESS = 1e-4  # mean square of what is left between sensors: none has so little noise, and rounding says nothing
+NOTHING_BETWEEN = (
+    1e-4  # mean square of what is left between sensors: none has so little noise, and rounding says nothing
+)
 _INNER_RANK = 1e-9  # of the largest singular value
 
 
@@ -196,7 +198,7 @@ def residual_of(fit: JointFit, raw: Array, total_field: Array | None, reference_
     if total_field is not None:  # of the length that is known: a sample's own noise along u is the residual itself
         seen_along = np.column_stack([u * (total_field[keep] / unit)[:, None], affine[:, 3]])
     across = plane.residual(used) if size > 3 else None
-    if across is not None and np.mean(across**2) < NOISELESS:
+    if across is not None and np.mean(across**2) < NOTHING_BETWEEN:
         across = None
     along = None if total_field is None else (length - total_field[keep]) / spread
     if fit.posterior is not None:
