@@ -20,6 +20,7 @@ demo: $(STAMP)
 lint: $(STAMP)
 	$(BIN)/ruff check .
 	$(BIN)/mypy
+	MYPYPATH=pipeline:plugins:studies:benchmarks:tests/joint $(BIN)/mypy --follow-imports=silent studies benchmarks
 	$(BIN)/lint-imports
 
 test: lint

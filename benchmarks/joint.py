@@ -134,7 +134,15 @@ def from_disk(samples: int, sensors: int) -> tuple[Callable[[], Any], Callable[[
         )
 
     class Recording:
-        count, usable, held = samples, None, folder
+        usable, held = None, folder
+
+        @property
+        def count(self) -> int:
+            return samples
+
+        @property
+        def sensors(self) -> int:
+            return sensors
 
         def read(self, start: int, stop: int) -> tuple[np.ndarray, np.ndarray]:
             return file["b_raw"][start:stop], np.full(stop - start, FIELD_NT)

@@ -164,11 +164,11 @@ def main() -> None:
         tell("\n## Instead of another effect\n\n| effects | motion | surveys | significant | adopted |")
         tell("|---|---|---|---|---|")
         for motion in MOTIONS:
-            for amplitude in (1, 10):
+            for amplitude in (1.0, 10.0):
                 effects = [{"type": n, "rms_nT": amplitude * NOISE_NT} | EFFECTS.get(n, {}) for n in TURNING]
                 late = ("sampling_lag", "clock_drift") if motion == "postures" else ()  # cannot be simulated there
                 surveys = [scenario(7, 4, motion, 0.01, e) for e in effects if e["type"] not in late]
-                tell(f"| {len(surveys)} kinds, {amplitude} x noise | {motion} | {counted(surveys)} |")
+                tell(f"| {len(surveys)} kinds, {amplitude:g} x noise | {motion} | {counted(surveys)} |")
     if chosen.power:
         tell("\n## Surveys with a source\n\n| sensors | source | motion | surveys | significant | adopted |")
         tell("|---|---|---|---|---|---|")
@@ -185,9 +185,9 @@ def main() -> None:
         for sensors in (4, 3):
             for motion in ("tumbling", "postures") if sensors == 4 else ("tumbling",):
                 for source in SOURCES:
-                    for amplitude in (1, 30):
+                    for amplitude in (1.0, 30.0):
                         row = verified(sensors, motion, source, amplitude)
-                        tell(f"| {sensors} | {source}, {amplitude} x noise | {motion} | {row} |")
+                        tell(f"| {sensors} | {source}, {amplitude:g} x noise | {motion} | {row} |")
 
 
 if __name__ == "__main__":

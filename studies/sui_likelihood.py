@@ -79,7 +79,7 @@ def turned(seed: int, height: float, count: int, line: bool = False) -> tuple[Ar
     survey = simulate(made)
     assert survey.truth.gradiometers is not None
     read = np.stack([survey.channels[f"gradient_{c}"][0] for c in COMPONENTS], axis=1)
-    return read, five(survey.truth.tensor), np.linalg.inv(survey.truth.gradiometers.matrix)
+    return read, five(survey.truth.tensor), np.linalg.inv(survey.truth.gradiometers.matrix).astype(float)
 
 
 BOUND, GAINED = "bound", "gained"
@@ -104,7 +104,7 @@ def trial(seed: int, height: float, count: int) -> dict[str, tuple[float, float]
         error = five(one.apply(full(read))) @ turn.T - truth
         over = scale * magnitude(one.apply(full(line))) - magnitude(full(line_truth))
         found[name] = (rms(error), rms(over))
-    found[BOUND] = (np.nan, bound(truth, np.linalg.inv(true_matrix), line_truth))
+    found[BOUND] = (np.nan, bound(truth, np.linalg.inv(true_matrix).astype(float), line_truth))
     found[GAINED] = (gained(read, truth, true_matrix), np.nan)
     return found
 
@@ -135,7 +135,7 @@ def gained(read: Array, truth: Array, true_matrix: Array) -> float:
     """By how much the log likelihood is higher at the estimate found from the truth than at the one found without."""
     known = invariants(full(truth[:1]))
     size, determinant = checked_invariants(float(known.i1[0]), float(known.i2[0]))
-    angle, mixing = shape_angle(determinant), np.linalg.inv(true_matrix)
+    angle, mixing = shape_angle(determinant), np.linalg.inv(true_matrix).astype(float)
     readings, offset = read / size, np.mean(read - truth @ mixing.T, axis=0) / size
     starts = (climbed(readings, Surface(mixing, offset, angle), True), search(readings, np.eye(5), angle))
     try:
@@ -148,7 +148,7 @@ def gained(read: Array, truth: Array, true_matrix: Array) -> float:
 def covered(seed: int, height: float, count: int, known: bool) -> Array:
     """Errors of one series, whitened by the covariance in the directions that are known; Gaussian noise."""
     read, truth, true_matrix = turned(seed, height, count)
-    matrix = np.linalg.inv(true_matrix)
+    matrix = np.linalg.inv(true_matrix).astype(float)
     rng = np.random.default_rng(10_000 + seed)
     offset = rng.uniform(-15, 15, 5)
     read = truth @ matrix.T + offset + FLOOR * rng.normal(size=truth.shape)
@@ -178,7 +178,7 @@ def far_away(seed: int, height: float, count: int, known: bool) -> bool | None:
         one = orbit_likelihood(full(read), *((float(of.i1[0]), float(of.i2[0])) if known else (None, None)))
     except DataError:
         return None
-    true_matrix = np.linalg.inv(matrix)
+    true_matrix = np.linalg.inv(matrix).astype(float)
     scale = 1.0 if known else abs(np.linalg.det(true_matrix) / np.linalg.det(one.matrix)) ** 0.2
     close = scale * rotation_of_five(nearest_in_gauge(one.matrix, true_matrix)[0]) @ one.matrix - true_matrix
     # at the maximum the coefficients are within some standard deviations; at another one they are far off

@@ -69,7 +69,7 @@ def written(trial: Trial, folder: Path) -> tuple[Path, Path]:
             continue
         known = {key: value for key, value in described.items() if key != "rms_nT"}
         if trial.effect == "channel_response":  # its square is about the mean of the survey that it was found in
-            known["reference"] = float(recorded(made).means[known["channel"]])
+            known["reference"] = float(recorded(made).origins[known["channel"]])
         second["effects"].append(known | truth.coefficients)
     write(made, folder / "first.h5")
     write(simulate(second), folder / "second.h5")

@@ -102,7 +102,7 @@ def tried(part: Part) -> dict[str, Any]:
         try:
             run_recipe(recipe, output)
         except MagtensorError as error:
-            return {"part": list(part), "refused": error.what}
+            return {"part": list(part), "refused": str(error)}
         told = json.loads((output / "verdict.json").read_text(encoding="utf-8"))
     errors = {k: (told["error"]["held_out"].get(k) or {}).get("total_field_rms_nT") for k in ("before", "after")}
     return {

@@ -182,6 +182,7 @@ def apply_and_refine(
         on_its_clock,
         stored_effects,
         those_here,
+        without_unread,
     )  # fmt: skip
     from magtensor.offsets_apart import scatter_for, without_scatter
     from magtensor.platform_frame import as_fitted, with_refined_rotation
@@ -211,6 +212,8 @@ def apply_and_refine(
         here = those_here(adopted, theta, origins, as_fitted(calibration, fitted), survey)
         adopted, theta = here.adopted, here.theta
         before, survey = survey, cleaned(survey, as_fitted(calibration, fitted), adopted, theta, origins)
+        if rows is None:
+            survey = without_unread(survey, adopted)
         if judge:
             known = calibration.values("calibration/noise_std") if "calibration/noise_std" in calibration else None
             survey = flagged(survey, fitted, known, uniform=uniform)

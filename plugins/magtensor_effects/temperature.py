@@ -18,8 +18,8 @@ Thermometer = Annotated[
 Order = Annotated[int, Orders((1, 2)), Field(ge=1, le=2, description="highest power of the temperature")]
 ThermalLag = Annotated[
     float,
-    Range(0.0, 3600.0, count=11, spacing="log"),
-    Field(ge=0, description="how far the sensor is behind the thermometer, s"),
+    Range(-300.0, 3600.0, count=11, spacing="log"),
+    Field(description="how far the sensor is behind the thermometer, s; below 0 the thermometer is behind the sensor"),
 ]
 
 

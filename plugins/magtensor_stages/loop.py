@@ -69,11 +69,11 @@ def close_loop(
     from magtensor.calibration.nominal import Nominal
     from magtensor.effect_errors import coefficient_variables, with_coefficients
     from magtensor.loop.correcting.correction import as_elsewhere
-    from magtensor.loop.correcting.stored import cleaned, effect_variables
+    from magtensor.loop.correcting.stored import LATE, cleaned, effect_variables
     from magtensor.loop.decisions import Decision, decision_of
     from magtensor.loop.evidence.own_noise import OwnNoise
     from magtensor.loop.fitting.errors_before_after import folds_for, held_out_error
-    from magtensor.loop.fitting.model import Fitting
+    from magtensor.loop.fitting.model import Fitting, unread
     from magtensor.loop.fitting.refit import disturbed, with_colour
     from magtensor.loop.inquiry import inquiry_of
     from magtensor.loop.near_nominal import doubt_of, labelled, settled
@@ -141,8 +141,11 @@ def close_loop(
         doubted = np.zeros(len(survey.time), dtype=bool)
         doubted[record.samples[disturbed(record, last, how)]] = True
         doubted = survey.made_from(doubted)
-        given["good"] = (("time", "sensor"), survey.good_by_sensor & ~doubted[:, None], {"long_name": "may be used"})
-        given["flags"] = flag_ranges(
-            survey.time, doubted, by="close_loop", reason="no calibration and no noise explain it"
-        )
+        late = unread(last.adopted, survey.time)
+        bad = (doubted | late)[:, None]
+        given["good"] = (("time", "sensor"), survey.good_by_sensor & ~bad, {"long_name": "may be used"})
+        given["flags"] = [
+            *flag_ranges(survey.time, doubted, by="close_loop", reason="no calibration and no noise explain it"),
+            *flag_ranges(survey.time, late, by="close_loop", reason=LATE),
+        ]
     return given

@@ -78,7 +78,7 @@ def _magnitude(five_components: Array) -> Array:
 def _to_truth(result: Survey, made: Simulated) -> Array:
     """(5, 5): the rotation, unknowable from the data, that takes the result nearest to the true correction."""
     assert made.truth.gradiometers is not None
-    true_matrix = np.linalg.inv(made.truth.gradiometers.matrix)
+    true_matrix = np.linalg.inv(made.truth.gradiometers.matrix).astype(float)
     return rotation_of_five(nearest_in_gauge(result.values("calibration/tensor_matrix"), true_matrix)[0])
 
 

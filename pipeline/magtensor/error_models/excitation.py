@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from functools import cached_property
@@ -172,18 +172,32 @@ class Excitation(Acting):
 
     def thermometer(self, name: str, lag_s: float = 0.0, delayed: bool = False, at_start: float = 0.0) -> Array:
         """A logged temperature without the noise of its log, seen through a lag as in `channel`: what has a thermal
-        mass does not jump, neither between samples nor where a log that is written seldom has a new value."""
-        return self.channel(name, lag_s, delayed, smooth=True, at_start=at_start)
+        mass does not jump, neither between samples nor where a log that is written seldom has a new value.
+
+        Below 0 the thermometer is the one that is behind: with a time constant, so that the temperature is the logged
+        one and that times its rate of change, or `delayed` as a whole; from where a log ends the temperature goes on
+        straight.
+        """
+        if lag_s >= 0:
+            return self.channel(name, lag_s, delayed, smooth=True, at_start=at_start)
+        ahead = first_order.ahead if delayed else first_order.undone
+        return self._kept((name, lag_s, delayed), lambda x: ahead(x.time, x.thermometer(name), -lag_s))
 
     def _course(self, name: str, lag_s: float, delayed: bool, smooth: bool) -> Array:
+        def made(x: Excitation) -> Array:
+            values = x._without_noise(name) if smooth else x.channel(name)
+            seen = x.later if delayed else x.lagged
+            return seen(values, lag_s) if lag_s else values
+
+        return self._kept((name, lag_s, delayed, smooth), made)
+
+    def _kept(self, key: tuple[Hashable, ...], made: Callable[[Excitation], Array]) -> Array:
+        """What is made of the whole survey, once, at the samples of this part of it."""
         if self.part_of is not None:
             whole, samples = self.part_of
-            return whole._course(name, lag_s, delayed, smooth)[samples]
-        key = name, lag_s, delayed, smooth
+            return whole._kept(key, made)[samples]
         if key not in self._lagged:
-            values = self._without_noise(name) if smooth else self.channel(name)
-            seen = self.later if delayed else self.lagged
-            self._lagged[key] = seen(values, lag_s) if lag_s else values
+            self._lagged[key] = made(self)
         return self._lagged[key]
 
     def _without_noise(self, name: str) -> Array:
@@ -199,7 +213,7 @@ class Excitation(Acting):
         return len(shape) == 2 and shape[1] == 3 and (len(self.sensors) != 3 or name in VECTORS)
 
     @cached_property
-    def _lagged(self) -> dict[tuple[str, float, bool, bool], Array]:
+    def _lagged(self) -> dict[tuple[Hashable, ...], Array]:
         return {}
 
     @cached_property

@@ -1,4 +1,4 @@
-"""The exact response of a first-order lag, tau y' + y = x, to a series that is known at its samples."""
+"""The exact response of a first-order lag, tau y' + y = x, to a series that is known at its samples, and back."""
 
 from __future__ import annotations
 
@@ -36,6 +36,25 @@ def smooth(time: Array, series: Array, tau: float) -> Array:
     weights = _moments(step / tau) * step ** np.arange(4)[:, None]
     driven = sum(w.reshape(-1, *[1] * (series.ndim - 1)) * c for w, c in zip(weights, coefficients[::-1], strict=True))
     return _recursion(np.concatenate([[1.0], np.exp(-step / tau)]), np.concatenate([series[:1], driven]))
+
+
+def undone(time: Array, series: Array, tau: float) -> Array:
+    """(N, ...) x of which a series y is the response: y + tau y', of what changes slowly from sample to sample."""
+    if len(time) < 2:
+        return series
+    found: Array = series + tau * np.gradient(series, time, axis=0)
+    return found
+
+
+def ahead(time: Array, series: Array, lead: float) -> Array:
+    """(N, ...) a series so much earlier, s, which beyond its end goes on straight."""
+    if len(time) < 2:
+        return series
+    flat = series.reshape(len(time), -1)
+    beyond = np.maximum(time + lead - time[-1], 0.0)
+    slopes = (flat[-1] - flat[-2]) / (time[-1] - time[-2])
+    moved = np.column_stack([np.interp(time + lead, time, column) for column in flat.T]) + np.outer(beyond, slopes)
+    return moved.reshape(series.shape)
 
 
 def _moments(a: Array) -> Array:

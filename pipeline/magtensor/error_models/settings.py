@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from magtensor.components import Component
     from magtensor.error_models.excitation import Excitation
 
-_LEAST_REACH = 0.8  # of the samples
+_LEAST_REACH = 0.8  # of the samples, or of the survey's duration
 
 
 @dataclass(frozen=True)
@@ -27,9 +27,10 @@ class Range:
         low, high: the limits.
         count: how many are tried before the best is refined between its neighbours.
         spacing: "linear" or "log" (with 0 added in front where `low` is 0, and where it is below 0 the same on the
-            other side, beyond `count`).
+            other side, beyond `count`, up to a fifth of the survey: a log that is late tells nothing of the end).
         of_duration: the limits are fractions of the survey's duration.
         sampled: nothing shorter than the time between samples is tried, which no sample would show.
+        late: below 0 the log of what is followed comes so much too late as a whole, in whatever form it is followed.
     """
 
     low: float
@@ -38,6 +39,7 @@ class Range:
     spacing: str = "linear"
     of_duration: bool = False
     sampled: bool = False
+    late: bool = False
 
     def between(self, low: float, high: float) -> list[float]:
         """Values between two neighbours of the grid, where more than one could be the best there; none."""
@@ -54,7 +56,8 @@ class Range:
             return [float(v) for v in np.linspace(low, high, self.count)]
         first = low if low > 0 else high / 10 ** (self.count / 4)
         grid = [float(v) for v in np.geomspace(first, high, self.count - (low <= 0))]
-        return [-v for v in grid[::-1] if v <= -low] + [0.0, *grid] if low <= 0 else grid
+        late = min(-low, (1.0 - _LEAST_REACH) * x.duration)
+        return [-v for v in grid[::-1] if v <= late] + [0.0, *grid] if low <= 0 else grid
 
 
 @dataclass(frozen=True)

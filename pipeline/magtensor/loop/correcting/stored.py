@@ -19,12 +19,14 @@ from magtensor.errors import DataError, UsageError
 from magtensor.loop.correcting.another_survey import TONE, begins_anew, shows_a_state
 from magtensor.loop.correcting.correction import corrected_raw, corrected_reference, hidden_objection
 from magtensor.loop.correcting.lengths import AVERAGING, averaged_otherwise
-from magtensor.loop.fitting.model import Adopted, Record
+from magtensor.loop.fitting.model import Adopted, Record, unread
 from magtensor.loop.fitting.record import record_of
 from magtensor.registry import Registry
+from magtensor.survey.flags import flag_ranges
 from magtensor.survey.model import Survey, Variable
 from magtensor.survey.times import split_since
 
+LATE = "the log of what an effect follows is late"
 MOST_BEYOND = 0.25  # of the range that a calibration has seen of a channel
 
 
@@ -226,6 +228,17 @@ def cleaned(
     if field is not None:
         changed["total_field"] = (("time",), field, dict(survey["total_field"].attrs))
     return survey.merged(changed)
+
+
+def without_unread(survey: Survey, adopted: Sequence[Adopted]) -> Survey:
+    """The survey with the samples at its end taken out of use of which a log that an effect follows, being late, tells
+    nothing."""
+    late = unread(adopted, survey.time)
+    if not late.any():
+        return survey
+    good = survey.good_by_sensor & ~late[:, None]
+    given: dict[str, Variable] = {"good": (("time", "sensor"), good, {"long_name": "may be used"})}
+    return survey.merged(given, flag_ranges(survey.time, late, by="apply", reason=LATE))
 
 
 def _lacking(effect: Adopted, record: Record) -> str:

@@ -15,6 +15,7 @@ from magtensor.calibration.nominal import Nominal
 from magtensor.calibration.types import Array
 from magtensor.components import Component
 from magtensor.error_models.excitation import Excitation
+from magtensor.error_models.settings import Range, profiled
 from magtensor.error_models.station import Station
 from magtensor.error_models.terms import Terms, joined
 from magtensor.errors import UsageError
@@ -155,6 +156,13 @@ class Adopted:
     def name(self) -> str:
         return self.component.name
 
+    @property
+    def late_s(self) -> float:
+        """s by which the log that it follows is late as a whole: of as much at the end of a survey it tells nothing."""
+        lag, grid = float(self.settings.get("lag_s", 0.0)), profiled(self.component).get("lag_s")
+        late = isinstance(grid, Range) and grid.spacing == "log" and (grid.late or self.settings.get("delayed", False))
+        return -lag if late and lag < 0 else 0.0
+
     def terms(self, x: Excitation) -> Terms:
         """Its regressors on a survey, those of other sensors left out."""
         if self.start is not None:
@@ -163,6 +171,13 @@ class Adopted:
         if not self.sensors:
             return every
         return every.only(i for i, s in enumerate(every.sensors) if s in self.sensors or s == "")
+
+
+def unread(adopted: Sequence[Adopted], time: Array) -> NDArray[np.bool_]:
+    """(N,) samples at whose times (N,) s a channel that an adopted model follows had not been read yet, its log being
+    late: the model goes on as well as it can."""
+    late = max((model.late_s for model in adopted), default=0.0)
+    return time + late > time[-1] if late else np.zeros(len(time), dtype=bool)
 
 
 def generic(model: Adopted) -> bool:

@@ -23,7 +23,7 @@ from magtensor.loop.evidence.assessment import Colours, colours_of, estimated, l
 from magtensor.loop.evidence.residual import Residual, quick, residual_of, taken_off
 from magtensor.loop.evidence.statistics import Estimate
 from magtensor.loop.evidence.stretches import borne_out, louder, too_loud
-from magtensor.loop.fitting.model import Adopted, Fitting, Record, State
+from magtensor.loop.fitting.model import Adopted, Fitting, Record, State, unread
 from magtensor.loop.fitting.seen import beside_the_site, excitation_of
 
 MOST_ROUNDS = 6
@@ -61,7 +61,7 @@ def joint_state(
     for round_ in range(MOST_ROUNDS):
         # what attitudes can determine nobody asks between the first fit and the last
         known = None if fit is None or round_ + 1 == MOST_ROUNDS else fit.coverage
-        fit = _fit(record, raw, reference, how, keep, known, fit)
+        fit = _fit(record, adopted, raw, reference, how, keep, known, fit)
         x = beside_the_site(excitation_of(record, fit, raw, lines), adopted, theta)
         if not adopted:
             break
@@ -70,7 +70,7 @@ def joint_state(
             theta = [t if len(t) == e.count else np.zeros(e.count) for t, e in zip(theta, each, strict=True)]
             if any(t.any() for t in theta):
                 raw, reference = without(record, each, theta)
-                fit = _fit(record, raw, reference, how, keep, start=fit)
+                fit = _fit(record, adopted, raw, reference, how, keep, start=fit)
                 x = beside_the_site(excitation_of(record, fit, raw, lines), adopted, theta)
                 each = [a.terms(x) for a in adopted]
         residual = quick(residual_of(fit, raw, reference, how.reference_noise))
@@ -86,7 +86,7 @@ def joint_state(
         raw, reference = without(record, each, theta)
         step = np.abs(after - before) / np.sqrt(np.maximum(np.diag(estimate.covariance), 1e-300))
         if np.max(step, initial=0.0) < SETTLED:
-            fit = _fit(record, raw, reference, how, keep, start=fit)
+            fit = _fit(record, adopted, raw, reference, how, keep, start=fit)
             x = beside_the_site(excitation_of(record, fit, raw, lines), adopted, theta)
             break
     if estimate is not None:
@@ -94,7 +94,7 @@ def joint_state(
         if not np.array_equal(shown, np.concatenate(theta)):
             theta = np.split(shown, edges)
             raw, reference = without(record, each, theta)
-            fit = _fit(record, raw, reference, how, keep, start=fit)
+            fit = _fit(record, adopted, raw, reference, how, keep, start=fit)
             x = beside_the_site(excitation_of(record, fit, raw, lines), adopted, theta)
     assert fit is not None
     return _state(record, adopted, theta, fit, raw, reference, how, x, estimate, lines)
@@ -156,6 +156,7 @@ def share_of(residual: Residual, terms: Terms, step: Array, colours: Colours) ->
 
 def _fit(
     record: Record,
+    adopted: Sequence[Adopted],
     raw: Array,
     reference: Array | None,
     how: Fitting,
@@ -165,7 +166,7 @@ def _fit(
 ) -> JointFit:
     assert reference is not None and record.total_field is not None and record.quiet_field is not None
     loud = record.total_field - record.quiet_field
-    usable = how.among(record.time) if how.without else None
+    usable = how.among(record.time) & ~unread(adopted, record.time)
 
     def fitted(believed: NDArray[np.bool_] | None) -> JointFit:
         options: dict[str, Any] = {
@@ -173,19 +174,19 @@ def _fit(
             "worst_error": how.worst_error if how.complete else _SLACK * how.worst_error,
         }  # fmt: skip
         if how.nominal is None:
-            return fit_recording(InMemory(raw, reference, usable), known=known, **options)
+            return fit_recording(InMemory(raw, reference, None if usable.all() else usable), known=known, **options)
         return fit_nominal(raw, reference, how.nominal, quiet_field=reference - loud, start=start, **options)
 
     try:
         fit = fitted(keep)
     except NotEnoughData:
         if not how.complete:  # refused with slack, it is refused without, and by the figures that were asked for
-            _fit(record, raw, reference, replace(how, complete=True), keep)
+            _fit(record, adopted, raw, reference, replace(how, complete=True), keep)
         raise
     if keep is not None or fit.keep.all():
         return fit
     more = (borne_out if how.searching else louder)(fit, raw, reference, how.reference_noise)
-    more = more if usable is None else more & usable
+    more = more & usable
     return fit if np.array_equal(more, fit.keep) else fitted(more)
 
 
@@ -203,8 +204,9 @@ def loud_stretches(record: Record, state: State, how: Fitting) -> tuple[tuple[fl
 
 
 def disturbed(record: Record, state: State, how: Fitting) -> NDArray[np.bool_]:
-    """(N,) samples that neither the calibration nor noise explains, be it as loud as it is there."""
-    out = ~np.asarray(state.fit.keep)
+    """(N,) samples that neither the calibration nor noise explains, be it as loud as it is there; those at which a late
+    log leaves the calibration without what it follows are none of them."""
+    out = ~np.asarray(state.fit.keep) & ~unread(state.adopted, record.time)
     if not how.without or not out.any():
         return out
     raw, reference = without(record, [a.terms(state.excitation) for a in state.adopted], state.theta)
@@ -216,7 +218,7 @@ def reweighed(record: Record, state: State, how: Fitting) -> State:
     """The state with C and o fitted as `how` says, its coefficients and the samples that it believes as they are."""
     each = [a.terms(state.excitation) for a in state.adopted]
     raw, reference = without(record, each, state.theta)
-    fit = _fit(record, raw, reference, how, np.asarray(state.fit.keep))
+    fit = _fit(record, state.adopted, raw, reference, how, np.asarray(state.fit.keep))
     x = beside_the_site(excitation_of(record, fit, raw, state.lines), state.adopted, state.theta)
     return _state(record, state.adopted, state.theta, fit, raw, reference, how, x, state.estimate, state.lines)
 
@@ -229,7 +231,7 @@ def require_determined(record: Record, state: State, how: Fitting) -> None:
     NotEnoughData: as in `fit_joint`.
     """
     raw, reference = without(record, [a.terms(state.excitation) for a in state.adopted], state.theta)
-    _fit(record, raw, reference, replace(how, complete=True), np.asarray(state.fit.keep))
+    _fit(record, state.adopted, raw, reference, replace(how, complete=True), np.asarray(state.fit.keep))
 
 
 def with_colour(record: Record, state: State, how: Fitting) -> State:

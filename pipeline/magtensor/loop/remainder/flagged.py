@@ -10,7 +10,7 @@ from magtensor.calibration.types import Mask
 from magtensor.loop.evidence.own_noise import OwnNoise
 from magtensor.loop.evidence.residual import residual_of
 from magtensor.loop.fitting.log_noise import channels_of
-from magtensor.loop.fitting.model import Record, State
+from magtensor.loop.fitting.model import Record, State, unread
 from magtensor.loop.fitting.refit import without
 
 LONGEST_SPIKE = 2  # samples: what lasts longer is no accident of the recording
@@ -42,6 +42,18 @@ def beyond_the_reference(state: State, record: Record) -> Mask:
             nearest = np.minimum(np.abs(at - record.time[after - 1]), np.abs(at - record.time[after]))
             out |= nearest > UNCOVERED * step
     return out
+
+
+def unread_words(state: State, record: Record) -> list[str]:
+    """How many samples were taken out of use because a log is late, which hardly matters for a spike's length."""
+    late = unread(state.adopted, record.time)
+    if late.sum() <= LONGEST_SPIKE:
+        return []
+    model = max(state.adopted, key=lambda model: model.late_s)
+    return [
+        f"the log that {model.name} follows is {model.late_s:.4g} s late: the last {int(late.sum())} samples, of which "
+        "it tells nothing, are flagged and have no part in the calibration"
+    ]
 
 
 def flagged_words(flagged: Mask, state: State, record: Record) -> tuple[str, bool]:

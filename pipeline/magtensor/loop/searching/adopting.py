@@ -228,7 +228,7 @@ def _suited(
 ) -> dict[str, Any]:
     """Settings whose lags suit the others: up to twice as long as they are, none if the data do not separate it."""
     for name, grid in ranges.items():
-        if settings[name] > 0:
+        if settings[name]:
             settings = {**settings, name: _near(gain, settings, name, max(grid.low, 0.0))}
             none = {**settings, name: 0.0}
             if grid.low <= 0 and gain(settings) < gain(none) + SEPARATION / 2.0:
@@ -246,7 +246,8 @@ def _changed(record: Record, state: State, number: int, settings: Mapping[str, A
 def _near(gain: Callable[[Mapping[str, Any]], float], settings: Mapping[str, Any], name: str, low: float) -> float:
     """The best value of a setting as far from where it is as `low` is."""
     here = float(settings[name])
-    return golden(lambda value: gain({**settings, name: value}), low, 2.0 * here - low, here)
+    first, last = sorted((low, 2.0 * here - low))
+    return golden(lambda value: gain({**settings, name: value}), first, last, here)
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ from magtensor.loop.evidence.stretches import ABOUT, LEAST_LOUD
 from magtensor.loop.fitting.model import Fitting, Record, State
 from magtensor.loop.fitting.refit import disturbed, without
 from magtensor.loop.remainder.changing_matrix import changing_matrices
-from magtensor.loop.remainder.flagged import beyond_the_reference, flagged_words, lasting
+from magtensor.loop.remainder.flagged import beyond_the_reference, flagged_words, lasting, unread_words
 from magtensor.loop.remainder.gradient_shape import MODEL, gradient_share
 from magtensor.loop.remainder.jitter import jitter_words
 from magtensor.loop.remainder.predictable import attitude_words, converter_words, shortened_words
@@ -88,7 +88,7 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
     if words:
         size = f"{excess:.3g} nT rms above the white noise, {_where(state)}"
         words.insert(0, size if excess else "in sum no more than the white noise")
-    beside = loud_words(state, record, found.how)
+    beside = loud_words(state, record, found.how) + unread_words(state, record)
     if small := [c.model.name for c in seen if c.of_second_order]:
         beside.append(
             f"{' and '.join(small)}: significant, and less than {SECOND_ORDER**0.5:.1%} of the size of what is "
