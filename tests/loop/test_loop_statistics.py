@@ -11,6 +11,8 @@ from scipy.stats import kstest
 
 from magtensor.calibration.mixture import likeliest_mixture
 from magtensor.error_models.quiet import quieted
+from magtensor.error_models.terms import joined
+from magtensor.loop.evidence import statistics
 from magtensor.loop.evidence.assessment import block_count, colours_of
 from magtensor.loop.evidence.colour import Colour, colour_of
 from magtensor.loop.evidence.gains import Gain
@@ -114,6 +116,28 @@ def test_significance_is_uniform_on_white_noise() -> None:
     p = p_values(slow=False, count=40)
     assert kstest(p[:, 0], "uniform").pvalue > 0.001
     assert kstest(p[:, 1], "uniform", alternative="greater").pvalue > 0.001  # the largest of several: never liberal
+
+
+def test_one_inverse_serves_the_tests_of_all_sensors(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(8)
+    record = synthetic(9, 960, added=0.3 * flicker(rng, (960, 4, 3)))
+    state = linear_state(record)
+    walk, scale = rng.standard_normal(960).cumsum(), rng.standard_normal(960)
+    terms = joined([state.excitation.offsets(walk, "nT"), state.excitation.scales(scale, "1")]).at(
+        state.residual.samples
+    )
+    colours = colours_of(state.residual)
+    blocks = grams(state.residual, terms, colours.across, colours.along, block_count(len(state.residual.affine)))
+    each = [[i for i, owner in enumerate(terms.sensors) if owner == name] for name in state.excitation.sensors]
+
+    def all_p() -> list[float]:
+        tests = statistics.Families(blocks, terms.sensors)
+        return [tests.p_value(own) for own in each]
+
+    with_it = all_p()
+    monkeypatch.setattr(statistics, "MANY", np.inf)
+    np.testing.assert_allclose(with_it, all_p(), rtol=1e-6)
+    assert np.ptp(with_it) > 0.01
 
 
 def test_slow_noise_does_not_pass_for_effects() -> None:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import h5py
+import numpy as np
 import pytest
 from loop_cases import adopted_names, scenario, verdict_of
 
@@ -46,3 +48,17 @@ def test_it_is_found_with_both_times(tmp_path: Path, sensors: int, strength: flo
 def test_a_jump_for_good_is_a_step(tmp_path: Path) -> None:
     told = verdict_of(tmp_path, scenario(12, magnet(0.6, 4)[0]), models=MODELS)
     assert adopted_names(told) == {"offset_step"}
+
+
+@pytest.mark.parametrize(("samples", "seed"), [(5, 41), pytest.param(8, 43, marks=pytest.mark.long)])
+def test_a_sensor_that_hangs_for_a_moment_is_a_disturbance(tmp_path: Path, samples: int, seed: int) -> None:
+    """A handful of samples, which the loading of a survey does not find: the last digit goes on changing."""
+
+    def hang(path: Path) -> None:
+        rng = np.random.default_rng(seed)
+        with h5py.File(path, "a") as file:
+            file["b_raw"][700 : 700 + samples, 1] = file["b_raw"][700, 1] + 0.01 * rng.standard_normal((samples, 3))
+
+    told = verdict_of(tmp_path, scenario(seed), hang, models=["offset_while", "offset_step", "passing_source"])
+    assert told["adopted"] == []
+    assert "mostly on S2: they are flagged" in told["unexplained"]["description"]

@@ -148,6 +148,18 @@ def test_a_stuck_sensor(load_variables: Load, variables: Variables) -> None:
     assert survey.flags[0].reason.startswith("stuck")
 
 
+def test_a_sensor_that_hangs_for_a_moment(load_variables: Load, variables: Variables) -> None:
+    """Short holds are no calm of the platform while the other sensors turn with it; single repeated rows may be."""
+    field = variables["b_raw"][1].copy()
+    for start, stop in ((60, 66), (150, 157), (300, 312)):
+        field[start:stop, 2] = field[start, 2]
+    field[220, 1] = field[219, 1]
+    survey = load_variables(changed(variables, "b_raw", lambda _: field))
+    stuck = np.flatnonzero(~survey.good_by_sensor[:, 2])
+    np.testing.assert_array_equal(stuck, [*range(60, 66), *range(150, 157), *range(300, 312)])
+    assert survey.good_by_sensor[:, [0, 1, 3]].all()
+
+
 def test_a_slow_sensor_is_not_stuck(load_variables: Load, variables: Variables) -> None:
     field = variables["b_raw"][1][(np.arange(400) // 3) * 3]
     survey = load_variables(changed(variables, "b_raw", lambda _: field))

@@ -60,18 +60,19 @@ def runs(equal: Bools) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     return edges[0::2], edges[1::2] - edges[0::2] + 1
 
 
-def believable_run(count: int, repeats: float) -> float:
+def believable_run(count: int, repeats: float, least: float = 10.0) -> float:
     """The longest run of one number that chance explains.
 
     If a share q of the samples repeats the one before (slow instruments, coarse steps), the longest run to be
-    expected among N samples is about ln N / -ln q; a chance of 1e-6 is granted, and ten samples in any case.
+    expected among N samples is about ln N / -ln q; a chance of 1e-6 is granted, and `least` samples in any case.
 
     Args:
         count: N.
         repeats: q.
+        least: a longer one may yet be chance, where the share is not known for a part of the record.
     """
     share = min(max(repeats, 1.0 / count), 1.0 - 1.0 / count)
-    return float(max(10.0, np.log(count * 1e6) / -np.log(share)))
+    return float(max(least, np.log(count * 1e6) / -np.log(share)))
 
 
 def span(field: Floats) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from magtensor.survey.recorded_numbers import Bools, Floats, believable_run, noise, resolution, runs, span
 
@@ -11,6 +12,7 @@ SINGLE_PRECISION, DOUBLE_PRECISION = 2e-7, 1e-12
 LEAST_FILLED_IN, MOST_FILLED_IN = 0.05, 0.96  # of the rows
 NEARLY_ALL = 0.8  # of the rows that are alike on all axes
 LEAST_CHANGES, LEAST_HELD_ROWS = 5, 2.5  # of a series that repeats its readings; rows from one to the next
+LEAST_STUCK = 2.0  # rows alike on all axes that are no fault, whatever other sensors do meanwhile
 UNLIKELY_GRID = 1e-8  # that the changes of other series lie on a regular grid
 LEAST_SEVERAL = 0.2  # of the changes, by more than one of the smallest steps
 
@@ -19,8 +21,9 @@ def stuck(field: Floats, others: Floats | None = None) -> Bools:
     """(N,) True where a sensor repeats itself for longer than its own record makes believable.
 
     Rest makes long runs too, so a run also needs a witness: other sensors, all of which moved meanwhile by more
-    than ten of their noise and of this sensor's steps; or, without others, a jump at the run's end larger than
-    99 % of all steps, or that it never ends.
+    than ten of their noise and of this sensor's steps, and then three rows suffice, for a sensor that moves with them
+    does not repeat itself on all axes; or, without others, a jump at the run's end larger than 99 % of all steps, or
+    that it never ends.
 
     Args:
         field: (N, 3) nT, or more columns.
@@ -33,14 +36,12 @@ def stuck(field: Floats, others: Floats | None = None) -> Bools:
     starts, lengths = runs(equal)
     if len(starts) == 0:
         return found
-    # Without its longest run, which is the suspect: one long fault must not make itself look usual.
-    longest = int(lengths.max())
-    believable = believable_run(len(field), (equal.sum() - (longest - 1)) / max(len(field) - longest, 1))
+    believable = _believable(len(field), lengths, 10.0 if others is None else LEAST_STUCK)
     steps = np.nan_to_num(np.linalg.norm(np.diff(field, axis=0), axis=1))
     moving = steps[steps > 0]
     usual = float(np.percentile(moving, 99)) if moving.size else 0.0
     step = max(resolution(column) for column in field.T)
-    enough = 10 * max(step, 0.0 if others is None else noise(others))
+    enough = 10 * max(step, 0.0 if others is None else _noise_of_all(others))
     for start, length in zip(starts, lengths, strict=True):
         if length <= believable:
             continue
@@ -50,6 +51,26 @@ def stuck(field: Floats, others: Floats | None = None) -> Bools:
         else:
             found[start:stop] |= stop == len(field) or steps[stop - 1] > usual
     return found
+
+
+def _believable(count: int, lengths: NDArray[np.intp], least: float) -> float:
+    """The longest run that chance explains, of those there are: without the longest, which is the first suspect, and
+    then without every other suspect, for faults must not make themselves look usual."""
+    suspects = np.arange(len(lengths)) == np.argmax(lengths)
+    for _ in range(2):
+        share = float(np.sum(lengths[~suspects] - 1)) / max(count - int(lengths[suspects].sum()), 1)
+        believable = believable_run(count, share, least)
+        suspects = lengths > believable
+    return believable
+
+
+def _noise_of_all(field: Floats) -> float:
+    """Noise of sensors (N, K, 3), nT: what they do not share, where that is less than what a smooth motion leaves."""
+    count = field.shape[1]
+    if count < 2:
+        return noise(field)
+    own = field - field.mean(axis=1, keepdims=True)
+    return min(noise(field), noise(own) * float(np.sqrt(count / (count - 1.0))))
 
 
 def stuck_axis(field: Floats, axis: int, others: Floats | None = None) -> Bools:
@@ -68,9 +89,7 @@ def stuck_axis(field: Floats, axis: int, others: Floats | None = None) -> Bools:
     starts, lengths = runs(values[1:] == values[:-1])
     if len(field) < 20 or len(starts) == 0:
         return found
-    longest = int(lengths.max())
-    repeats = (values[1:] == values[:-1]).sum() - (longest - 1)
-    believable = believable_run(len(field), repeats / max(len(field) - longest, 1))
+    believable = _believable(len(field), lengths, 10.0)
     suspect = lengths > believable
     if not suspect.any():
         return found

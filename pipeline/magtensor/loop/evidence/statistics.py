@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -17,6 +17,8 @@ MOSTLY_NOISE = 2.0  # times the noise in regressors: less is left in a direction
 BLOCK_COUNTS = (120, 30, 12)  # long blocks protect against correlation longer than a short block
 LEAST_BLOCKS = 6
 LEAST_LEFT = 1e-3  # of the information in a direction, without any one block
+SINGULAR = 1e-8  # of the largest eigenvalue
+MANY = 2  # times the coefficients tested: with so many others one inverse of all serves all tests
 
 
 @dataclass(frozen=True)
@@ -168,36 +170,58 @@ def explained_by_each(g: Grams) -> tuple[Array, NDArray[np.int_]]:
 
 
 def family_p(g: Grams, sensors: Sequence[str], subset: Sequence[int] | None = None) -> float:
-    """P value that the subset's coefficients (all if None) are zero, the others being free.
-
-    For several block lengths, the largest p taken: a noise correlated for longer than the short blocks does not fool
-    the long ones. Where a family has more directions than a third of the blocks, it is tested sensor by sensor and the
-    sensors are combined (valid under any dependence). Where no block length serves a family that way, as that of a
-    source beside a hundred postures, as many of its best determined directions are tested as a third of the blocks.
+    """P value that the subset's coefficients (all if None) are zero, the others being free, as in `Families`.
 
     Parameters
     ----------
     g: the finest blocks.
     sensors: (P,) whose each term is.
     """
-    chosen = list(range(g.count)) if subset is None else list(subset)
-    groups = [[i for i in chosen if sensors[i] == name] for name in dict.fromkeys(sensors[i] for i in chosen)]
-    finest = len(g.zz)
-    found: list[float] = []
-    for count in sorted({min(c, finest) for c in BLOCK_COUNTS}, reverse=True):
-        if count < LEAST_BLOCKS:
-            continue
-        part = g if count == finest else g.merged(count)
-        tested = _Jackknife(part)
-        if 3 * len(chosen) <= count:
-            found.append(tested.p_value(chosen))
-            continue
-        fitting = [tested.p_value(group, alone=chosen) for group in groups if 3 * len(group) <= count]
-        if len(fitting) == len(groups) > 1:
-            found.append(cauchy_combination(fitting))
-    if not found and finest >= LEAST_BLOCKS:
-        found.append(_Jackknife(g).p_value(chosen, most=finest // 3))
-    return max(found, default=1.0)
+    return Families(g, tuple(sensors)).p_value(range(g.count) if subset is None else subset)
+
+
+@dataclass(frozen=True)
+class Families:
+    """Tests of families of coefficients in the same blocks.
+
+    For several block lengths, the largest p taken: a noise correlated for longer than the short blocks does not fool
+    the long ones. Where a family has more directions than a third of the blocks, it is tested sensor by sensor and the
+    sensors are combined (valid under any dependence). Where no block length serves a family that way, as that of a
+    source beside a hundred postures, as many of its best determined directions are tested as a third of the blocks.
+
+    Attributes:
+        finest: the finest blocks.
+        sensors: (P,) whose each term is.
+    """
+
+    finest: Grams
+    sensors: tuple[str, ...]
+
+    @cached_property
+    def _jackknives(self) -> list[_Jackknife]:
+        finest = len(self.finest.zz)
+        counts = sorted({min(count, finest) for count in BLOCK_COUNTS}, reverse=True)
+        used = [count for count in counts if count >= LEAST_BLOCKS]
+        return [_Jackknife(self.finest if count == finest else self.finest.merged(count)) for count in used]
+
+    def p_value(self, subset: Sequence[int]) -> float:
+        """That the subset's coefficients are zero, the others being free."""
+        chosen = list(subset)
+        owners = dict.fromkeys(self.sensors[i] for i in chosen)
+        groups = [[i for i in chosen if self.sensors[i] == name] for name in owners]
+        found: list[float] = []
+        for blocks in self._jackknives:
+            count = len(blocks.blocks.zz)
+            if 3 * len(chosen) <= count:
+                found.append(blocks.p_value(chosen))
+                continue
+            fitting = [blocks.p_value(group, alone=chosen) for group in groups if 3 * len(group) <= count]
+            if len(fitting) == len(groups) > 1:
+                found.append(cauchy_combination(fitting))
+        if not found and self._jackknives:
+            finest = self._jackknives[0]
+            found.append(finest.p_value(chosen, most=len(finest.blocks.zz) // 3))
+        return max(found, default=1.0)
 
 
 def wald_p(g: Grams, chosen: Sequence[int], alone: Sequence[int] = (), most: int | None = None) -> float:
@@ -214,9 +238,15 @@ def wald_p(g: Grams, chosen: Sequence[int], alone: Sequence[int] = (), most: int
 
 @dataclass(frozen=True)
 class _Jackknife:
-    """Blocks, each of which is left out in turn."""
+    """Blocks, each of which is left out in turn.
+
+    Attributes:
+        beside: of coefficients that are free beside those tested, what `_Others` knows; one sensor after the other is
+            tested beside the same.
+    """
 
     blocks: Grams
+    beside: dict[tuple[int, ...], tuple[_Others, _Others]] = field(default_factory=dict)
 
     @cached_property
     def every(self) -> tuple[Array, Array]:
@@ -238,19 +268,12 @@ class _Jackknife:
 
         count, terms = len(self.blocks.zz), self.blocks.count
         subset = np.asarray(chosen, dtype=int)
-        free = np.setdiff1d(np.arange(terms), [*chosen, *alone])
-        others = np.zeros((terms, len(free)))
-        if len(free):  # in the directions that the data show
-            basis = identifiable(self.every[0][0][np.ix_(free, free)], self.own.of(free))
-            others = np.zeros((terms, basis.shape[1]))
-            others[free] = basis
-        full_n, full_y = _without_others(*self.every, subset, others)
+        (full_n, full_y), (n, y) = self._equations(subset, np.setdiff1d(np.arange(terms), [*chosen, *alone]))
         basis, values = _directions(full_n[0], self.own.of(subset))
         basis = basis[:, np.argsort(values)[::-1][:most]]
         p = basis.shape[1]
         if p == 0 or p >= count:
             return 1.0
-        n, y = _without_others(*self.without_each, subset, others)
         basis = _confirmed(basis @ np.linalg.inv(np.linalg.cholesky(basis.T @ full_n[0] @ basis)).T, n)
         p = basis.shape[1]
         if p == 0:
@@ -264,6 +287,105 @@ class _Jackknife:
         except np.linalg.LinAlgError:
             return 1.0
         return float(fdtrc(p, count - p, max((count - p) / (p * (count - 1)) * t2, 0.0)))
+
+    def _equations(
+        self, chosen: NDArray[np.int_], free: NDArray[np.int_]
+    ) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+        """Normal equations (1, p, p), (1, p) of the chosen coefficients, some others free, and (B, p, p), (B, p)
+        without each block."""
+        if len(free) > MANY * len(chosen) and len(free) + len(chosen) == self.blocks.count:
+            found = self._beside_all_others(chosen)
+            if found is not None:
+                return found
+        together, apart = self._others(tuple(free.tolist()))
+        return together.projected_off(*self.every, chosen), apart.projected_off(*self.without_each, chosen)
+
+    def _others(self, free: tuple[int, ...]) -> tuple[_Others, _Others]:
+        """Of all blocks together, and without each."""
+        if free not in self.beside:
+            which = np.array(free, dtype=int)
+            basis = np.zeros((self.blocks.count, 0))
+            if free:  # in the directions that the data show
+                seen = identifiable(self.every[0][0][np.ix_(which, which)], self.own.of(which))
+                basis = np.zeros((self.blocks.count, seen.shape[1]))
+                basis[which] = seen
+            self.beside[free] = _Others.of(*self.every, basis), _Others.of(*self.without_each, basis)
+        return self.beside[free]
+
+    @cached_property
+    def _inverses(self) -> tuple[Array, Array] | None:
+        """(1, P, P), (B, P, P) of all coefficients' information, of all blocks together and without each; None where
+        some direction is not seen."""
+        if identifiable(self.every[0][0], self.own).shape[1] < self.blocks.count:
+            return None
+        root = self.own.root
+        scaled = [n / np.outer(root, root) for n in (self.every[0], self.without_each[0])]
+        try:
+            found = [np.linalg.inv(n).astype(float, copy=False) for n in scaled]
+        except np.linalg.LinAlgError:
+            return None
+        if any(_singular(n, inverse).any() for n, inverse in zip(scaled, found, strict=True)):
+            return None
+        return found[0] / np.outer(root, root), found[1] / np.outer(root, root)
+
+    def _beside_all_others(self, chosen: NDArray[np.int_]) -> tuple[tuple[Array, Array], tuple[Array, Array]] | None:
+        """Normal equations of some coefficients, all others free, of all blocks together and without each, by one
+        inverse for whichever are chosen; None where some direction is not seen."""
+        if self._inverses is None:
+            return None
+        out = []
+        for inverse, (_, y) in zip(self._inverses, (self.every, self.without_each), strict=True):
+            n = np.linalg.inv(inverse[:, chosen[:, None], chosen]).astype(float, copy=False)
+            theta = (inverse[:, chosen] @ y[:, :, None])[:, :, 0]
+            out.append((n, (n @ theta[:, :, None])[:, :, 0]))
+        return out[0], out[1]
+
+
+@dataclass(frozen=True)
+class _Others:
+    """Directions that are free beside what is tested, in a batch of normal equations.
+
+    Attributes:
+        basis: (P, q).
+        inverse: (B, q, q) of their information.
+        theta: (B, q) what they are without what is tested.
+    """
+
+    basis: Array
+    inverse: Array
+    theta: Array
+
+    @classmethod
+    def of(cls, n: Array, y: Array, basis: Array) -> _Others:
+        """In normal equations (B, P, P), (B, P)."""
+        inverse = _inverse_of_each(basis.T @ n @ basis)
+        return cls(basis, inverse, (inverse @ (y @ basis)[:, :, None])[:, :, 0])
+
+    def projected_off(self, n: Array, y: Array, chosen: NDArray[np.int_]) -> tuple[Array, Array]:
+        """The part of the chosen coefficients in the normal equations."""
+        mixed = n[:, chosen] @ self.basis
+        n2 = n[:, chosen[:, None], chosen] - mixed @ self.inverse @ np.swapaxes(mixed, 1, 2)
+        y2 = y[:, chosen] - (mixed @ self.theta[:, :, None])[:, :, 0]
+        return n2, y2
+
+
+def _inverse_of_each(m: Array) -> Array:
+    """(B, q, q) of symmetric matrices, directions with next to nothing left out."""
+    try:
+        out = np.linalg.inv(m).astype(float, copy=False)
+        singular = _singular(m, out)
+    except np.linalg.LinAlgError:
+        out, singular = np.empty_like(m), np.ones(len(m), dtype=bool)
+    if singular.any():
+        out[singular] = np.linalg.pinv(m[singular], rcond=SINGULAR, hermitian=True)
+    return out
+
+
+def _singular(m: Array, inverse: Array) -> NDArray[np.bool_]:
+    """(B,) whether symmetric matrices (B, q, q) may have an eigenvalue that is next to nothing beside the largest."""
+    norm = np.abs(m).sum(axis=1).max(axis=1, initial=0.0)
+    condition = norm * np.abs(inverse).sum(axis=1).max(axis=1, initial=0.0)  # no less than the ratio of the two
+    return ~(condition * SINGULAR < 1.0)
 
 
 def _confirmed(basis: Array, n: Array) -> Array:
@@ -281,17 +403,6 @@ def _confirmed(basis: Array, n: Array) -> Array:
     _, s, vt = np.linalg.svd(lost, full_matrices=True)
     rank = int(np.sum(s > 0.1 * s[0]))
     return basis @ vt[rank:].T
-
-
-def _without_others(n: Array, y: Array, chosen: NDArray[np.int_], others: Array) -> tuple[Array, Array]:
-    """The chosen coefficients' part of a batch of normal equations, the others' directions (P, q) projected off."""
-    if not others.shape[1]:
-        return n[:, chosen[:, None], chosen], y[:, chosen]
-    inverse = np.linalg.pinv(others.T @ n @ others, rcond=1e-8, hermitian=True)
-    mixed = n[:, chosen] @ others
-    n2 = n[:, chosen[:, None], chosen] - mixed @ inverse @ np.swapaxes(mixed, 1, 2)
-    y2 = y[:, chosen] - (mixed @ inverse @ (y @ others)[:, :, None])[:, :, 0]
-    return n2, y2
 
 
 def cauchy_combination(p_values: Sequence[float]) -> float:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from magtensor.calibration.by_sensor import by_sensor
 from magtensor.calibration.joint import JointFit, nearest_frame
@@ -13,6 +14,8 @@ from magtensor.calibration.types import Array
 from magtensor.error_models.excitation import Excitation
 from magtensor.loop.fitting.model import Adopted, Record, of_the_site
 
+LONGEST = 5  # samples that are disturbed one after the other, over which the field is seen from those beside them
+BESIDE = 8  # samples to either side, from which it is
 _MATTERS = 1e-10  # of the square of the field: noise with less makes no regressor noisy
 
 
@@ -25,6 +28,7 @@ def excitation_of(record: Record, fit: JointFit, raw: Array, lines: Sequence[flo
     raw: (N, S, 3) nT, that the fit was made from: a strong effect on one sensor would else be in the common field.
     """
     b = fit.scalar.field(fit.plane.coordinates(raw)) if fit.posterior is None else fit.posterior.field
+    b = over_disturbances(b, np.asarray(fit.keep), record.time, record.run)
     b = of_known_length(b, record.total_field)
     q = nearest_frame(fit.forward)
 
@@ -36,6 +40,33 @@ def excitation_of(record: Record, fit: JointFit, raw: Array, lines: Sequence[flo
         more = np.random.default_rng(0).normal(size=b.shape) @ noise.T
         again = seen(of_known_length(b + more, record.total_field))
     return record.excitation(*seen(b), lines, matrix=fit.forward @ q, again=again)
+
+
+def over_disturbances(b: Array, keep: NDArray[np.bool_], time: Array, run: NDArray[np.int_]) -> Array:
+    """Fields (N, 3) nT without what disturbed single samples: a spike of one sensor is in the field that all are
+    thought to see, and a rate of change or what remembers the field would have it for some time.
+
+    Parameters
+    ----------
+    keep: (N,) samples that the fit believes; time: (N,) s; run: (N,) number of the contiguous run.
+    """
+    edges = np.flatnonzero(np.diff(np.concatenate(([False], ~keep, [False])).astype(np.int8)))
+    starts, stops = edges[0::2], edges[1::2]
+    short = (stops - starts <= LONGEST) & (starts >= BESIDE) & (stops + BESIDE <= len(keep))
+    starts, stops = starts[short], stops[short]
+    inside = run[np.maximum(starts - BESIDE, 0)] == run[np.minimum(stops + BESIDE, len(run)) - 1]
+    disturbed, near = np.zeros((2, len(keep)), dtype=bool)
+    for first, stop in zip(starts[inside], stops[inside], strict=True):
+        disturbed[first:stop] = True
+        near[first - BESIDE : stop + BESIDE] = True
+    near &= keep
+    if not disturbed.any() or near.sum() < BESIDE:
+        return b
+    from scipy.interpolate import CubicSpline
+
+    out = b.copy()
+    out[disturbed] = CubicSpline(time[near], b[near])(time[disturbed])
+    return out
 
 
 def of_known_length(b: Array, total_field: Array | None) -> Array:

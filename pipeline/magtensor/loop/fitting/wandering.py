@@ -25,15 +25,18 @@ LEAST_SENSORS = 3  # two have one contrast, which does not tell whose effect it 
 
 
 def quieter(state: State) -> Iterator[tuple[str, ...]]:
-    """Names of the sensors without the one that wanders most; then without the next, as long as that wanders far more
-    than the quietest."""
+    """Names of the sensors without the one that wanders most; without those that stand out most from the rest; without
+    all that wander far more than the quietest: with many sensors, a search after each in turn would take far too long.
+    """
     names = state.excitation.sensors
     every, white = all_noise(state), state.residual.noise.reshape(-1, 3)
     more = np.sqrt(np.mean(every**2, axis=1) / np.mean(white**2, axis=1))
     order = np.argsort(-more)
-    for count in range(1, len(names) - LEAST_SENSORS + 1):
-        if more[order[count - 1]] <= UNEQUAL * more.min():
-            return
+    most = min(int(np.sum(more > UNEQUAL * more.min())), len(names) - LEAST_SENSORS)
+    if most < 1:
+        return
+    falls = more[order[:most]] / more[order[1 : most + 1]]
+    for count in sorted({1, int(np.argmax(falls)) + 1, most}):
         yield tuple(name for i, name in enumerate(names) if i not in order[:count])
 
 

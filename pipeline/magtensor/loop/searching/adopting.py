@@ -20,10 +20,10 @@ from magtensor.loop.fitting.separation import SEPARATION
 from magtensor.loop.searching.beginnings import beginning, extent, least_gain, with_beginning
 from magtensor.loop.searching.contribution import (
     KEEP_ALPHA,
+    families,
     happens_once,
     held_out,
     put_back,
-    significance,
     significance_at_once,
     slices,
 )
@@ -139,9 +139,13 @@ def _sensors_showing(state: State, which: int) -> tuple[str, ...] | None:
     names = [s for s in state.excitation.sensors if s in owners]
     if len(names) < 2:
         return None
-    p_of = significance_at_once if happens_once(state.adopted[which]) else significance
     own = {s: [part.start + i for i, o in enumerate(owners) if o == s] for s in names}
-    showing = [s for s in names if p_of(state, own[s]) < KEEP_ALPHA / len(names)]
+    if happens_once(state.adopted[which]):
+        p_values = [significance_at_once(state, own[s]) for s in names]
+    else:
+        tests = families(state)
+        p_values = [tests.p_value(own[s]) for s in names]
+    showing = [s for s, p in zip(names, p_values, strict=True) if p < KEEP_ALPHA / len(names)]
     return tuple(showing) if showing and len(showing) < len(names) else None
 
 

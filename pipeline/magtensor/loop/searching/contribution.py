@@ -18,7 +18,7 @@ from magtensor.loop.evidence.gains import Gain, concentrated, focused_gain, held
 from magtensor.loop.evidence.grams import Grams, Whitened, grams
 from magtensor.loop.evidence.own_noise import OwnNoise
 from magtensor.loop.evidence.residual import Residual, taken_off
-from magtensor.loop.evidence.statistics import family_p
+from magtensor.loop.evidence.statistics import Families
 from magtensor.loop.fitting.model import Adopted, Fitting, Record, State
 from magtensor.loop.fitting.refit import joint_state
 from magtensor.loop.fitting.trial import WORST_RISE, on_the_folds_of, trial
@@ -26,6 +26,7 @@ from magtensor.loop.searching.beginnings import at_its_limit
 
 LEAST_FALL = 5e-4  # of the error on held-out blocks, by what lasts: 3 % of the noise is no effect anybody would miss
 APART_ALPHA = 1e-4  # what differs between sensors has to be as unlikely, before an effect of all is not the reference's
+LEAST_SAMPLES = 6.0  # that hold nearly all of what happened once
 KEEP_ALPHA = 0.01  # an adopted effect that is no longer significant at this level is dropped
 
 
@@ -34,10 +35,10 @@ def slices(state: State) -> list[slice]:
     return [slice(int(a), int(b)) for a, b in itertools.pairwise(edges)]
 
 
-def significance(state: State, chosen: Sequence[int]) -> float:
-    """P value of some of the adopted coefficients, the others free: of the residual with their part put back."""
+def families(state: State) -> Families:
+    """Tests of some of the adopted coefficients, the others free: of the residual with their part put back."""
     assert state.terms is not None
-    return family_p(_blocks(state), state.terms.sensors, list(chosen))
+    return Families(_blocks(state), state.terms.sensors)
 
 
 def significance_at_once(state: State, chosen: Sequence[int]) -> float:
@@ -120,26 +121,28 @@ def eliminate(record: Record, state: State, how: Fitting, fixed: int) -> tuple[S
     """Drop models that no longer earn their place, the weakest first: those whose coefficients are not what their
     settings assume, those that are not significant beside the others, and those without which the others predict
     held-out blocks as well, or better if all noise counts alike. A single one has just passed the gates but for the
-    last: what raises the error on blocks that it has not seen is no effect, whatever noise it makes white."""
+    last: what raises the error on blocks that it has not seen is no effect, whatever noise it makes white; nor is what
+    is over at once."""
     if len(state.adopted) == 1:
-        if fixed or not _lasts(state.adopted[0]) or _rise(state, 0) <= 1.0:
+        if fixed or not (_over_at_once(state, 0) or (_lasts(state.adopted[0]) and _rise(state, 0) > 1.0)):
             return state, ()
         return without_models(record, state, [0], how), (state.adopted[0].name,)
     dropped: list[str] = []
     while len(state.adopted) > fixed:
         assert state.terms is not None
-        blocks, freedom = _blocks(state), state.residual.freedom
+        tests, freedom = families(state), state.residual.freedom
+        blocks = tests.finest
         parts = slices(state)[fixed:]
         values = [
             _of_an_event(state, fixed + i)
             if happens_once(state.adopted[fixed + i])
-            else family_p(blocks, state.terms.sensors, list(range(p.start, p.stop)))
+            else tests.p_value(range(p.start, p.stop))
             for i, p in enumerate(parts)
         ]
         order = np.arange(state.terms.count)
         gains = [held_out_gain(blocks, freedom, (order < p.start) | (order >= p.stop)).total for p in parts]
         rises = [_rise(state, fixed + i) for i in range(len(parts))]
-        unlike = [i for i in range(fixed, len(state.adopted)) if not agrees(state, i)]
+        unlike = [i for i in range(fixed, len(state.adopted)) if not agrees(state, i) or _over_at_once(state, i)]
         if unlike:
             weakest = unlike[0]
         elif max(values) >= KEEP_ALPHA:
@@ -187,6 +190,19 @@ def _of_an_event(state: State, place: int) -> float:
     noise = OwnNoise(put_back(state.residual, mine, state.theta[place]), state.terms.only(others) if others else None)
     times = [g.count for g in profiled(state.adopted[place].component).values() if isinstance(g, EventTimes)]
     return noise.p_value(mine) * float(np.prod(times))
+
+
+def _over_at_once(state: State, place: int) -> bool:
+    """Whether what an adopted model says of something that happens once lies in a handful of samples that the fit
+    believes, or in none, all others being flagged: a sensor that hangs, a spark. It has nearly as many coefficients."""
+    if not happens_once(state.adopted[place]):
+        return False
+    assert state.terms is not None
+    mine = state.terms.only(range(*slices(state)[place].indices(state.terms.count)))
+    theta, outputs = state.theta[place], 3 * len(state.excitation.sensors)
+    on_each = np.column_stack([mine.contribution(theta, outputs), mine.on_reference(theta)])
+    size = np.sum((on_each - on_each.mean(axis=0)) ** 2, axis=1)
+    return float(size.sum()) ** 2 < LEAST_SAMPLES * float(np.sum(size**2)) or not size.any()
 
 
 def _rise(state: State, place: int) -> float:

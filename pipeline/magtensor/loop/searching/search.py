@@ -66,7 +66,7 @@ def search(
         ended = _without_those_that_wander(ended, rounds)
     record, state, how, steps = ended.record, ended.state, ended.how, ended.steps
     last = _settled(record, on_those_that_show(record, state, how, len(declared)), how)
-    if last.fit.keep.sum() < state.fit.keep.sum():  # what only these samples asked for goes with them
+    if (state.fit.keep & ~last.fit.keep).any():  # what only these samples asked for goes with them
         last, steps = _weighed_once_more(record, last, steps, how, len(declared))
     shared = ended.shared
     if shared is None or shared.objection == SINGLE_STRETCH:  # it may be flagged now

@@ -1,0 +1,47 @@
+"""Spikes of single sensors: what follows how the field changes is found beside them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from loop_cases import lasting_effects, scenario, suspects, verdict_of
+
+from magtensor.loop.fitting.seen import over_disturbances
+
+SPIKES = 25
+
+
+def spiked(path: Path) -> None:
+    """Single outputs that are off by thousands of nT, as a connector makes them."""
+    rng = np.random.default_rng(9)
+    with h5py.File(path, "a") as file:
+        raw = file["b_raw"][:]
+        at = rng.choice(len(raw), SPIKES, replace=False)
+        raw[at, rng.integers(0, 4, SPIKES), rng.integers(0, 3, SPIKES)] += 5000.0 * rng.standard_normal(SPIKES)
+        file["b_raw"][:] = raw
+
+
+@pytest.mark.parametrize("name", ["averaging", "eddy_current", pytest.param("hysteresis", marks=pytest.mark.long)])
+def test_what_follows_the_turning_is_found_beside_spikes(tmp_path: Path, name: str) -> None:
+    told = verdict_of(tmp_path, scenario(51, {"type": name, "rms_nT": 10.0}), spiked, lasting_effects())
+    assert name in suspects(told) and len(told["adopted"]) == 1, told["unexplained"]["description"]
+    assert told["adopted"][0]["evidence"]["held_out_rms_after_nT"] < 1.15 * told["noise_floor_nT"]
+
+
+def test_the_field_is_seen_over_what_is_disturbed() -> None:
+    rng = np.random.default_rng(2)
+    time = np.cumsum(rng.uniform(0.45, 0.55, 600))
+    run = (np.arange(600) >= 300).astype(int)
+    field = 5e4 * np.stack([np.cos(0.3 * time), np.sin(0.3 * time), 0.2 * np.sin(0.1 * time)], axis=1)
+    keep = np.ones(600, dtype=bool)
+    keep[[50, 51, 120, 299, 450]] = False
+    keep[200:220] = False  # too long to be known from its ends
+    disturbed = field + 4000.0 * rng.standard_normal((600, 3)) * ~keep[:, None]
+    seen = over_disturbances(disturbed, keep, time, run)
+    assert np.abs(seen - field)[[50, 51, 120, 450]].max() < 27.0  # 5 h^4 / 384 of the fourth derivative, h three samples
+    np.testing.assert_array_equal(seen[keep], field[keep])
+    np.testing.assert_array_equal(seen[200:220], disturbed[200:220])
+    np.testing.assert_array_equal(seen[299], disturbed[299])  # at the end of a run
