@@ -151,13 +151,17 @@ NO_REFERENCE = (
 )
 
 
+MADE = ("good", "is_reading")  # by loading, of every survey
+
+
 def _require(stage: PlannedStage, survey: Survey) -> None:
     """The plan knew only what a loader may give; now the data are there."""
     for need in stage.declares.needs:
         if not any(fnmatchcase(path, need) for path in survey.paths()):
             from magtensor.errors import DataError
 
-            has = f"it has {', '.join(p for p in survey.paths() if '/' not in p or p.startswith('reference/'))}"
+            own = [p for p in survey.paths() if p not in MADE and ("/" not in p or p.startswith("reference/"))]
+            has = f"it has {', '.join(own)}"
             raise DataError(
                 f"stage {stage.name} needs {need}, which this survey does not have",
                 where=str(survey.attributes.get("source", "")),

@@ -69,11 +69,11 @@ def surveys_fitted(
         DataError: an error model needs what a survey does not show, or makes no sense in this fit.
     """
     from magtensor.loop.correcting.stored import begun_with, started
-    from magtensor.loop.fitting.model import Adopted
+    from magtensor.loop.fitting.model import as_declared
     from magtensor.loop.fitting.several import Together, surveys_state
 
     first = surveys[0][1]
-    adopted = [Adopted(component, settings) for component, settings in chosen.values()]
+    adopted = as_declared(chosen.values(), first.time)
     measured = field.measured and all(joint_surveys.has_measured_size(one) for _, one in surveys)
     _require_sense(adopted, measured, len(surveys))
     records = _records(surveys, uses, measured)

@@ -164,6 +164,14 @@ def test_wrong_options(options: dict[str, object], words: str, surveys: tuple[Pa
         magtensor.close_loop(surveys[0], **options)  # type: ignore[arg-type]
 
 
+def test_a_declared_drift_is_known_as_long_as_the_survey(surveys: tuple[Path, Path]) -> None:
+    """Over an hour, of which it has seen ten minutes, it would be extrapolated wherever it is applied."""
+    for declared, span_s in ((["offset_drift"], 599.5), ({"offset_drift": {"span_s": 900.0}}, 900.0)):
+        made = magtensor.close_loop(surveys[0], declared=declared, search=[])
+        (effect,) = [json.loads(str(text)) for text in made.dataset["calibration"]["effects"].values]
+        assert effect["settings"]["span_s"] == span_s
+
+
 def test_wrong_surveys(surveys: tuple[Path, Path]) -> None:
     with pytest.raises(magtensor.UsageError, match="not ndarray"):
         magtensor.close_loop(np.zeros(3))  # type: ignore[arg-type]

@@ -41,7 +41,9 @@ def test_the_field_is_seen_over_what_is_disturbed() -> None:
     keep[200:220] = False  # too long to be known from its ends
     disturbed = field + 4000.0 * rng.standard_normal((600, 3)) * ~keep[:, None]
     seen = over_disturbances(disturbed, keep, time, run)
-    assert np.abs(seen - field)[[50, 51, 120, 450]].max() < 27.0  # 5 h^4 / 384 of the fourth derivative, h three samples
+    assert (
+        np.abs(seen - field)[[50, 51, 120, 450]].max() < 27.0
+    )  # 5 h^4 / 384 of the fourth derivative, h three samples
     np.testing.assert_array_equal(seen[keep], field[keep])
     np.testing.assert_array_equal(seen[200:220], disturbed[200:220])
     np.testing.assert_array_equal(seen[299], disturbed[299])  # at the end of a run

@@ -156,7 +156,8 @@ def _alike(units: str, other: str) -> bool:
 
 @dataclass(frozen=True)
 class Duration:
-    """A time that is the survey's own duration, s: kept with the model, so that it means the same on another survey."""
+    """A time that is the survey's own duration, s, unless a recipe gives another one: kept with the model, so that it
+    means the same on another survey."""
 
     def values(self, x: Excitation) -> list[Any]:
         """The survey's duration."""

@@ -15,7 +15,7 @@ from magtensor.components import Component
 from magtensor.error_models.needs import missing
 from magtensor.errors import DataError, NotEnoughData, UsageError, did_you_mean
 from magtensor.loop.decisions import Decision
-from magtensor.loop.fitting.model import Adopted, Fitting, Record, State
+from magtensor.loop.fitting.model import Adopted, Fitting, Record, State, as_declared
 from magtensor.loop.fitting.record import record_of
 from magtensor.loop.fitting.refit import joint_state, without
 from magtensor.loop.fitting.wandering import unweighed
@@ -346,7 +346,7 @@ def inquiry_of(
     record = record_of(survey)
     if len(record.time) < 2:
         raise NotEnoughData("no samples are left in use", where=str(survey.attributes.get("source", "")))
-    begin = [Adopted(component, settings) for component, settings in declared.values()]
+    begin = as_declared(declared.values(), record.time)
     names = {a.name for a in begin}
     open_ = [m for m in models if m.name not in names]
     return Inquiry(record, open_, how, declared=begin, most_effects=most_effects, alpha=alpha)

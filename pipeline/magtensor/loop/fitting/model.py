@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -15,7 +15,7 @@ from magtensor.calibration.nominal import Nominal
 from magtensor.calibration.types import Array
 from magtensor.components import Component
 from magtensor.error_models.excitation import Excitation
-from magtensor.error_models.settings import Range, profiled
+from magtensor.error_models.settings import Duration, Range, profiled
 from magtensor.error_models.station import Station
 from magtensor.error_models.terms import Terms, joined
 from magtensor.errors import UsageError
@@ -171,6 +171,17 @@ class Adopted:
         if not self.sensors:
             return every
         return every.only(i for i, s in enumerate(every.sensors) if s in self.sensors or s == "")
+
+
+def as_declared(chosen: Iterable[tuple[Component, Mapping[str, Any]]], time: Array) -> list[Adopted]:
+    """Error models that a recipe declares for a survey with samples at these times (N,) s, whose duration stands where
+    a model knows a course over so much time and the recipe does not say over how much."""
+    models = []
+    for component, settings in chosen:
+        spans = {name for name, mark in profiled(component).items() if isinstance(mark, Duration)}
+        known = dict.fromkeys(spans - set(settings), float(time[-1] - time[0]))
+        models.append(Adopted(component, {**settings, **known}))
+    return models
 
 
 def unread(adopted: Sequence[Adopted], time: Array) -> NDArray[np.bool_]:

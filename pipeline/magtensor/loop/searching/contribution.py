@@ -124,7 +124,7 @@ def eliminate(record: Record, state: State, how: Fitting, fixed: int) -> tuple[S
     last: what raises the error on blocks that it has not seen is no effect, whatever noise it makes white; nor is what
     is over at once."""
     if len(state.adopted) == 1:
-        if fixed or not (_over_at_once(state, 0) or (_lasts(state.adopted[0]) and _rise(state, 0) > 1.0)):
+        if fixed or not (over_at_once(state, 0) or (_lasts(state.adopted[0]) and _rise(state, 0) > 1.0)):
             return state, ()
         return without_models(record, state, [0], how), (state.adopted[0].name,)
     dropped: list[str] = []
@@ -142,7 +142,7 @@ def eliminate(record: Record, state: State, how: Fitting, fixed: int) -> tuple[S
         order = np.arange(state.terms.count)
         gains = [held_out_gain(blocks, freedom, (order < p.start) | (order >= p.stop)).total for p in parts]
         rises = [_rise(state, fixed + i) for i in range(len(parts))]
-        unlike = [i for i in range(fixed, len(state.adopted)) if not agrees(state, i) or _over_at_once(state, i)]
+        unlike = [i for i in range(fixed, len(state.adopted)) if not agrees(state, i) or over_at_once(state, i)]
         if unlike:
             weakest = unlike[0]
         elif max(values) >= KEEP_ALPHA:
@@ -192,7 +192,7 @@ def _of_an_event(state: State, place: int) -> float:
     return noise.p_value(mine) * float(np.prod(times))
 
 
-def _over_at_once(state: State, place: int) -> bool:
+def over_at_once(state: State, place: int) -> bool:
     """Whether what an adopted model says of something that happens once lies in a handful of samples that the fit
     believes, or in none, all others being flagged: a sensor that hangs, a spark. It has nearly as many coefficients."""
     if not happens_once(state.adopted[place]):

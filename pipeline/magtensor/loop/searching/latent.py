@@ -189,7 +189,7 @@ def tried_source(
     record, after = renewed(record, after, how)
     if _turning(record, after):
         return replace(found, objection="its waveform follows the direction of the field"), None
-    model = Adopted(component, {"noise_nT": [float(v) for v in _own_noise(after)]})
+    model = Adopted(component, {"noise_nT": [float(f"{v:.4g}") for v in _own_noise(after)]})
     after = replace(after, adopted=(*after.adopted[:-1], model))
     gain = found.gain
     evidence = Assessment(estimate, gain, gain, None, None, found.p, found.p, found.p, state.colours, estimate.theta)

@@ -131,20 +131,23 @@ def z_of(p: float) -> float | None:
 
 
 def _rejected(found: Search) -> list[dict[str, Any]]:
-    """Every model that was tried and not adopted, as it stood in the last round that looked at it closely."""
+    """Every model that was tried and not adopted, as it stood in the first round in which the data asked for it, and in
+    the last that looked at it closely: what was adopted in between may have taken its place."""
     adopted = {a.name for a in found.last.adopted}
+    asked_for: dict[str, str] = {}
     last: dict[str, str] = {}
     looked_at = {c.model.name for step in found.steps for c in step.candidates}
     for number, step in enumerate(found.steps, 1):
-        for candidate in step.candidates:
-            if step.adopted is None or candidate is not step.adopted:
-                last[candidate.model.name] = f"round {number}: {why(candidate, step.adopted)}"
-        for name, reason in step.refused.items():
-            last[name] = f"round {number}: {reason}"
-        for name in set(step.dropped) - set(step.refused):
-            last[name] = f"round {number}: dropped, no longer significant beside the others"
+        now = {c.model.name: why(c, step.adopted) for c in step.candidates if c is not step.adopted}
+        now |= step.refused
+        now |= dict.fromkeys(set(step.dropped) - set(step.refused), "dropped, no longer significant beside the others")
+        last |= {name: f"round {number}: {reason}" for name, reason in now.items()}
+        for name in [c.model.name for c in step.candidates if c.passes and c.model.name in now]:
+            asked_for.setdefault(name, last[name])
     for name in {name for step in found.steps for name in step.screened}:
         last.setdefault(name, "screened with every setting: it explains too little to be looked at closely")
+    for name, reason in asked_for.items():
+        last[name] = reason if last[name] == reason else f"{reason}; {last[name]}"
     if found.shared is not None and found.shared.significant:
         last[NAME] = found.shared.objection or "not among the models that may be adopted"
     last |= {name: f"could not be tried: {reason}" for name, reason in found.failed.items() if name not in looked_at}

@@ -20,7 +20,7 @@ from magtensor.loop.fitting.refit import joint_state, loud_stretches
 from magtensor.loop.fitting.trial import on_the_folds_of, trial
 from magtensor.loop.fitting.wandering import all_noise, narrowed_to, of_sensors, quieter, unweighed
 from magtensor.loop.searching.adopting import on_those_that_show
-from magtensor.loop.searching.contribution import borne_out, eliminate, without_models
+from magtensor.loop.searching.contribution import borne_out, eliminate, over_at_once, without_models
 from magtensor.loop.searching.found import Search, Step
 from magtensor.loop.searching.gates import ALPHA
 from magtensor.loop.searching.latent import NAME, SINGLE_STRETCH, renewed, sought
@@ -66,7 +66,8 @@ def search(
         ended = _without_those_that_wander(ended, rounds)
     record, state, how, steps = ended.record, ended.state, ended.how, ended.steps
     last = _settled(record, on_those_that_show(record, state, how, len(declared)), how)
-    if (state.fit.keep & ~last.fit.keep).any():  # what only these samples asked for goes with them
+    over = any(over_at_once(last, place) for place in range(len(declared), len(last.adopted)))
+    if over or (state.fit.keep & ~last.fit.keep).any():  # what only these samples asked for goes with them
         last, steps = _weighed_once_more(record, last, steps, how, len(declared))
     shared = ended.shared
     if shared is None or shared.objection == SINGLE_STRETCH:  # it may be flagged now
