@@ -4,7 +4,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from magtensor.error_models.settings import Beginning, Forms
+from magtensor.error_models.settings import Beginning, Cleaned, Forms
 
 Delayed = Annotated[
     bool,
@@ -14,7 +14,7 @@ Delayed = Annotated[
 
 Smooth = Annotated[
     bool,
-    Forms((False, True)),
+    Cleaned((False, True)),
     Field(
         description="true: without the noise of the channel's log, as far as its smooth course tells; false: as logged"
     ),

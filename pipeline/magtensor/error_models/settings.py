@@ -185,6 +185,11 @@ class Forms(Choice):
         return list(self.options[:1])
 
 
+class Cleaned(Forms):
+    """A channel as it was logged, or without the noise of its log: forms alike only where that noise is small beside
+    the channel's course. So the second one is tried as soon as a model is looked at closely."""
+
+
 @dataclass(frozen=True)
 class Beginning:
     """What a response that lags had from before the survey began, in the units of its channel.

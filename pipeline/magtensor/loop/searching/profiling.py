@@ -11,7 +11,7 @@ import numpy as np
 from magtensor.calibration.types import Array
 from magtensor.components import Component
 from magtensor.error_models.excitation import Excitation
-from magtensor.error_models.settings import AnyChannel, Beginning, EventTimes, Frequencies, Range, profiled
+from magtensor.error_models.settings import AnyChannel, Beginning, Cleaned, EventTimes, Frequencies, Range, profiled
 from magtensor.error_models.terms import Terms, joined
 from magtensor.errors import UsageError
 from magtensor.loop.evidence.assessment import WHITE, colours_of, estimated, likeliest
@@ -184,6 +184,7 @@ def refined(model: Component, settings: dict[str, Any], state: State, failed: di
     """Settings on a range, moved between the neighbours of the best grid value by golden section; a lag of none stays
     one where the data do not separate the two, and so does a response in equilibrium at the survey's start."""
     few = thinned(state, REFINING_SAMPLES)
+    settings = _without_log_noise(model, settings, state, few, failed)
     for name, grid in profiled(model).items():
         if not isinstance(grid, (Range, EventTimes, Frequencies)):
             continue
@@ -218,6 +219,31 @@ def refined(model: Component, settings: dict[str, Any], state: State, failed: di
         settings = {**settings, name: best}
     settings = begun(model, settings, state, few)
     return _about_what_it_fits(model, settings, state, failed) if model.about is not None else settings
+
+
+def _without_log_noise(
+    model: Component, settings: dict[str, Any], state: State, few: tuple[Residual, Terms | None], failed: dict[str, str]
+) -> dict[str, Any]:
+    """Settings with the channel as it was logged or without the noise of its log, whichever the data tell from the
+    other: what is slower than the channel has less of that noise, and a lag would be found that there is none of."""
+    grids = profiled(model)
+    forms = {name: grid.options for name, grid in grids.items() if isinstance(grid, Cleaned)}
+    none = {name: 0.0 for name, grid in grids.items() if isinstance(grid, Range) and of_ratios(grid) and grid.low <= 0}
+    residual, given = few
+    here = terms_of(model, settings, state.excitation, failed) if forms else None
+    if here is None:
+        return settings
+    here = here.at(residual.samples)
+    together = here if given is None else joined([given, here])
+    score = Scorer(residual, given, likeliest(residual, together, [colours_of(residual), WHITE]).colours)
+    best, known = settings, score(here) + SEPARATION / 2.0
+    for name, options in forms.items():
+        others = [{**settings, name: option} for option in options if option != settings[name]]
+        for other in [changed for one in others for changed in ({**one, **none}, one)]:
+            terms = terms_of(model, other, state.excitation, failed)
+            if terms is not None and (gain := score(terms.at(residual.samples))) > known:
+                best, known = other, gain
+    return best
 
 
 def _its_time(
