@@ -72,7 +72,7 @@ def test_of_two_logs_of_one_cause_the_noisier_is_named_as_a_rival(tmp_path: Path
 
 @pytest.mark.parametrize(("log_noise", "rms_nT"), [(0.005, 3.0), pytest.param(0.015, 0.5, marks=pytest.mark.long)])
 def test_a_noisy_log_takes_no_name_away(log_noise: float, rms_nT: float, tmp_path: Path) -> None:
-    """Through a lag the noise of a log is less, so that a response to any channel, which may lag, seemed to do better."""
+    """Through a lag a log has less noise, so that a response to any channel, which may lag, seemed to do better."""
     survey = scenario(81, {"type": "supply_offset", "channel": "supply", "rms_nT": rms_nT})
     supply = {"type": "supply", "discharge_V_per_h": 0.1, "wander_rms_V": 0.05, "wander_time_s": 20.0}
     survey["channels"] = survey["channels"] | {"supply": supply | {"log_noise": log_noise}}
