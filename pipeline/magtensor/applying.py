@@ -211,11 +211,13 @@ def apply_and_refine(
         adopted = on_its_clock(adopted, theta, origins, calibration, as_fitted(calibration, fitted), survey)
         here = those_here(adopted, theta, origins, as_fitted(calibration, fitted), survey)
         adopted, theta = here.adopted, here.theta
+        known = calibration.values("calibration/noise_std") if "calibration/noise_std" in calibration else None
+        if judge and adopted:  # what an effect makes of the field beside a spike would be full of it
+            survey = flagged(survey, fitted, known, uniform=uniform)
         before, survey = survey, cleaned(survey, as_fitted(calibration, fitted), adopted, theta, origins)
         if rows is None:
             survey = without_unread(survey, adopted)
         if judge:
-            known = calibration.values("calibration/noise_std") if "calibration/noise_std" in calibration else None
             survey = flagged(survey, fitted, known, uniform=uniform)
         words = {
             "not_taken_off": here.left_in,

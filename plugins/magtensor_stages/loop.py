@@ -124,7 +124,9 @@ def close_loop(
     outcome |= {"unexplained": left, "held_out": {"before": before, "after": after}}
     if doubt is not None:
         outcome["calibration"] = doubt.facts()
-    clean = cleaned(survey, calibration, last.adopted, last.theta, record.origins)
+    undisturbed = np.array(survey.good)
+    undisturbed[record.samples[~last.fit.keep]] = False
+    clean = cleaned(survey, calibration, last.adopted, last.theta, record.origins, undisturbed)
     believed = np.zeros(len(survey.time), dtype=bool)
     believed[record.samples[last.fit.keep]] = True
     given = common_frame(clean, calibration, "joint") | effect_variables(

@@ -16,6 +16,7 @@ from magtensor.error_models.waveform import NAME, bends, course_of, too_little_s
 from magtensor.loop.correcting.another_survey import as_begun_here
 from magtensor.loop.fitting.model import Adopted, Record, State
 from magtensor.loop.fitting.refit import without
+from magtensor.loop.fitting.seen import over_disturbances
 from magtensor.tensor.geometry import array_design
 
 MOST_STEPS = 8
@@ -40,7 +41,8 @@ def corrected_raw(
     record: all samples of the survey, channels with the calibration's origins taken off.
     calibration: C and o.
     adopted: the effects; theta: their coefficients.
-    good: (N,) samples from which others may be interpolated and the waveform of a source that nobody logged be found.
+    good: (N,) samples from which others may be interpolated and the waveform of a source that nobody logged be found;
+        over those that are not error models look from the ones beside them.
     """
     hidden = _hidden(adopted)
     if hidden is not None:
@@ -56,9 +58,10 @@ def corrected_raw(
     forward = np.linalg.inv(calibration.matrix)
 
     def terms_for(raw: Array, models: Sequence[Adopted]) -> list[Terms]:
-        b = calibration.apply(raw)
-        output = by_sensor(forward, b) + calibration.offset
-        x = record.excitation(_whole(output), _whole(b), matrix=np.asarray(forward, dtype=float))
+        b = _whole(calibration.apply(raw))
+        if good is not None:
+            b = over_disturbances(b, good, record.time, record.run)
+        x = record.excitation(by_sensor(forward, b) + calibration.offset, b, matrix=np.asarray(forward, dtype=float))
         return [model.terms(x) for model in models]
 
     each = terms_for(raw, [model for model, _ in own])

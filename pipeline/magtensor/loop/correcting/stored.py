@@ -198,8 +198,12 @@ def cleaned(
     adopted: Sequence[Adopted],
     theta: Sequence[Array],
     origins: Mapping[str, Array],
+    good: NDArray[np.bool_] | None = None,
 ) -> Survey:
     """The survey with the adopted effects taken off `b_raw` and `total_field`.
+
+    Args:
+        good: (N,) samples in whose field error models may look; the survey's own if None.
 
     Raises:
         DataError: the survey lacks a channel that an effect follows.
@@ -217,7 +221,7 @@ def cleaned(
                 "apply a calibration without this effect, or log what it follows",
             )
     try:
-        raw = corrected_raw(record, calibration, adopted, theta, survey.good)
+        raw = corrected_raw(record, calibration, adopted, theta, survey.good if good is None else good)
         field = corrected_reference(record, adopted, theta)
     except (KeyError, ValueError) as error:
         names = ", ".join(a.name for a in adopted)

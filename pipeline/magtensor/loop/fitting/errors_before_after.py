@@ -104,7 +104,7 @@ def held_out_error(
         train[test] = False
         try:
             # the whole record makes the regressors: a lag remembers what went on while the test samples were taken
-            state = joint_state(record, adopted, how, start, keep=train)
+            state = joint_state(record, adopted, how, start, keep=train, seen=np.asarray(keep))
         except DataError:
             return None
         raw, field = without(record, [a.terms(state.excitation) for a in adopted], state.theta)

@@ -42,6 +42,7 @@ def joint_state(
     start: Sequence[Array] | None = None,
     lines: Sequence[float] = (),
     keep: NDArray[np.bool_] | None = None,
+    seen: NDArray[np.bool_] | None = None,
 ) -> State:
     """Fit C, o and every coefficient together.
 
@@ -52,6 +53,7 @@ def joint_state(
     ----------
     start: coefficients of each model to begin with; zero if None.
     keep: (N,) samples to believe; judged anew if None.
+    seen: (N,) samples in whose field error models may look; those that the fit believes if None.
     """
     theta = [np.zeros(0)] * len(adopted) if start is None else [np.array(t) for t in start]
     raw, reference = record.raw, record.total_field
@@ -62,7 +64,7 @@ def joint_state(
         # what attitudes can determine nobody asks between the first fit and the last
         known = None if fit is None or round_ + 1 == MOST_ROUNDS else fit.coverage
         fit = _fit(record, adopted, raw, reference, how, keep, known, fit)
-        x = beside_the_site(excitation_of(record, fit, raw, lines), adopted, theta)
+        x = beside_the_site(excitation_of(record, fit, raw, lines, seen), adopted, theta)
         if not adopted:
             break
         each = [a.terms(x) for a in adopted]
@@ -71,7 +73,7 @@ def joint_state(
             if any(t.any() for t in theta):
                 raw, reference = without(record, each, theta)
                 fit = _fit(record, adopted, raw, reference, how, keep, start=fit)
-                x = beside_the_site(excitation_of(record, fit, raw, lines), adopted, theta)
+                x = beside_the_site(excitation_of(record, fit, raw, lines, seen), adopted, theta)
                 each = [a.terms(x) for a in adopted]
         residual = quick(residual_of(fit, raw, reference, how.reference_noise))
         terms = joined(each).at(residual.samples)
@@ -87,7 +89,7 @@ def joint_state(
         step = np.abs(after - before) / np.sqrt(np.maximum(np.diag(estimate.covariance), 1e-300))
         if np.max(step, initial=0.0) < SETTLED:
             fit = _fit(record, adopted, raw, reference, how, keep, start=fit)
-            x = beside_the_site(excitation_of(record, fit, raw, lines), adopted, theta)
+            x = beside_the_site(excitation_of(record, fit, raw, lines, seen), adopted, theta)
             break
     if estimate is not None:
         shown = without_noise(np.concatenate(theta), estimate)
@@ -95,7 +97,7 @@ def joint_state(
             theta = np.split(shown, edges)
             raw, reference = without(record, each, theta)
             fit = _fit(record, adopted, raw, reference, how, keep, start=fit)
-            x = beside_the_site(excitation_of(record, fit, raw, lines), adopted, theta)
+            x = beside_the_site(excitation_of(record, fit, raw, lines, seen), adopted, theta)
     assert fit is not None
     return _state(record, adopted, theta, fit, raw, reference, how, x, estimate, lines)
 

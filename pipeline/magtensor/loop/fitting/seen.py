@@ -19,31 +19,35 @@ BESIDE = 8  # samples to either side, from which it is
 _MATTERS = 1e-10  # of the square of the field: noise with less makes no regressor noisy
 
 
-def excitation_of(record: Record, fit: JointFit, raw: Array, lines: Sequence[float] = ()) -> Excitation:
+def excitation_of(
+    record: Record, fit: JointFit, raw: Array, lines: Sequence[float] = (), seen: NDArray[np.bool_] | None = None
+) -> Excitation:
     """Modelled outputs and field of every sample from the common field of a fit, of the length that is known: the noise
     in what is seen of it is what the total field's residual is made of, and models would find it there.
 
     Parameters
     ----------
     raw: (N, S, 3) nT, that the fit was made from: a strong effect on one sensor would else be in the common field.
+    seen: (N,) samples in whose field models may look; those that the fit believes if None.
     """
+    believed = np.asarray(fit.keep) if seen is None else seen
     b = fit.scalar.field(fit.plane.coordinates(raw)) if fit.posterior is None else fit.posterior.field
-    b = over_disturbances(b, np.asarray(fit.keep), record.time, record.run)
+    b = over_disturbances(b, believed, record.time, record.run)
     b = of_known_length(b, record.total_field)
     q = nearest_frame(fit.forward)
 
-    def seen(b: Array) -> tuple[Array, Array]:
+    def outputs_and_fields(b: Array) -> tuple[Array, Array]:
         return by_sensor(fit.forward, b) + fit.offset, np.repeat((b @ q)[:, None], len(record.sensors), axis=1)
 
     again, noise = None, fit.scalar.matrix  # of outputs divided by theirs
     if fit.posterior is None and np.mean(noise**2) > _MATTERS * np.mean(b**2):
         more = np.random.default_rng(0).normal(size=b.shape) @ noise.T
-        again = seen(of_known_length(b + more, record.total_field))
-    return record.excitation(*seen(b), lines, matrix=fit.forward @ q, again=again)
+        again = outputs_and_fields(of_known_length(b + more, record.total_field))
+    return record.excitation(*outputs_and_fields(b), lines, matrix=fit.forward @ q, again=again)
 
 
 def over_disturbances(b: Array, keep: NDArray[np.bool_], time: Array, run: NDArray[np.int_]) -> Array:
-    """Fields (N, 3) nT without what disturbed single samples: a spike of one sensor is in the field that all are
+    """Fields (N, ...) nT without what disturbed single samples: a spike of one sensor is in the field that all are
     thought to see, and a rate of change or what remembers the field would have it for some time.
 
     Parameters
