@@ -154,6 +154,7 @@ def test_a_survey_of_two_sensors_whose_places_are_known(tmp_path: Path) -> None:
     assert calibrated["calibrated/good"].all()
 
 
+@pytest.mark.long
 def test_spikes_do_not_spoil_the_verification(folder: Path) -> None:
     blocks = [
         magtensor.close_loop(folder / "heated.h5", search=["current_field"], verify=path).verdict["error"]["verify"]

@@ -141,6 +141,7 @@ def test_a_model_without_its_channel(survey: Path) -> None:
         magtensor.explore(survey, search=["supply_scale"]).adopt("supply_scale")
 
 
+@pytest.mark.long
 def test_a_plugin_file_is_named_changed_and_named_again(tmp_path: Path, explorer: Explorer) -> None:
     file = tmp_path / "heater.py"
     file.write_text(PLUGIN.format(factor=""))

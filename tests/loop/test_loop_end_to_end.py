@@ -246,6 +246,7 @@ def test_a_declared_model_without_its_channel_is_refused_in_words(tmp_path: Path
         run(planned, empty_survey(planned))
 
 
+@pytest.mark.long
 def test_verification_is_as_good_as_with_the_effect_declared(tmp_path: Path) -> None:
     coefficients = [[0.3, -0.1, 0.2], [-0.4, 0.2, 0.1], [0.1, 0.3, -0.2], [0.2, -0.2, 0.4]]
     effect = {"type": "temperature_offset", "lag_s": 100.0, "reference_degC": 20.0, "nT_per_degC": coefficients}

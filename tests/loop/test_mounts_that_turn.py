@@ -19,13 +19,14 @@ MODELS = [
 ]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("name", "true", "sensors"),
     [
         ("temperature_alignment", {"lag_s": 60.0}, ["S1", "S2", "S3", "S4"]),
-        pytest.param("temperature_alignment", {"lag_s": 60.0}, ["S3"], marks=pytest.mark.long),
-        pytest.param("alignment_drift", {"tau_s": 600.0}, ["S2"], marks=pytest.mark.long),
-        pytest.param("turn_step", {"time_s": 500.0}, ["S2"], marks=pytest.mark.long),
+        ("temperature_alignment", {"lag_s": 60.0}, ["S3"]),
+        ("alignment_drift", {"tau_s": 600.0}, ["S2"]),
+        ("turn_step", {"time_s": 500.0}, ["S2"]),
     ],
 )
 def test_each_is_told_from_the_others(name: str, true: dict[str, Any], sensors: list[str], tmp_path: Path) -> None:
