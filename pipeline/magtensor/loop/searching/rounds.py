@@ -297,7 +297,7 @@ def _kept(record: Record, before: Trial, chosen: Candidate, how: Fitting) -> tup
     if (slow or channels) and of_all_alike(after.state, which):
         drift = "drifts" if slow else f"follows {' and '.join(channels)}"
         return None, f"fitted, all sensors show it alike: an error of the base station that {drift} would look the same"
-    if hardly_begun(model, x) and not slow:
+    if hardly_begun(model, x) and not slow and chosen.moved is None:  # of two of a kind one may be slow
         return None, "fitted, it lags by more than half of the survey: any drift would do as well"
     if at_its_limit(model.component, model.settings, after.state.excitation):
         return None, "fitted, it would have begun as far from what it follows as is possible: something else dies away"
