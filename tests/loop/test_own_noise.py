@@ -56,7 +56,7 @@ NOISES = {
     "one axis": ({2: 3.0}, 60.0, 1, 2),
     "one axis that walks": ({2: 5.0}, 3000.0, 1, 2),
 }
-SHORT = ("white", "one sensor, smooth", "one axis that walks")
+SHORT = ("one sensor, smooth",)
 
 
 @pytest.mark.parametrize("which", [n if n in SHORT else pytest.param(n, marks=pytest.mark.long) for n in NOISES])
