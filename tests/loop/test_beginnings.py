@@ -149,7 +149,7 @@ def test_what_dies_away_is_no_response_to_the_temperature_that_began_with_it(see
 def test_a_beginning_at_its_limit_is_none(part: float, limit: bool, tmp_path: Path) -> None:
     x = linear_state(loaded(tmp_path, scenario(65))).excitation
     model = Registry.load().find("error_model", "temperature_offset")
-    widest = 10.0 * float(np.ptp(x.logged["temperature"]))  # as docs/loop.md says
+    widest = 10.0 * float(np.ptp(x.logged["temperature"]))  # as docs/loop_steps.md says
     settings = {"order": 1, "channel": "temperature", "lag_s": 60.0, "delayed": False, "at_start": part * widest}
     assert at_its_limit(model, settings, x) is limit
     assert not at_its_limit(model, settings | {"lag_s": 5.0, "delayed": True}, x)  # a delay has no beginning
