@@ -203,7 +203,7 @@ def summary(verdict: dict[str, Any]) -> str:
             f"held-out residual {figure(before)} -> {figure(after)} nT",
             *([f"z {evidence['z']:.3g}"] if evidence["z"] is not None else []),
             *([f"not told from {', '.join(rivals)}"] if rivals else []),
-            *([f"its channel not told from {', '.join(others)}"] if others else []),
+            *([_other_channels(one, ", ".join(others))] if others else []),
         ]
         lines.append(f"  adopted {one['error_model']}: {'; '.join(words)}")
     looked_at = {c["error_model"] for step in verdict.get("steps", []) for c in step["looked_at"]}
@@ -215,6 +215,11 @@ def summary(verdict: dict[str, Any]) -> str:
         missing = ", ".join(f"{n['error_model']} ({' and '.join(n['missing'])})" for n in verdict["not_tested"])
         lines.append(f"  not tested for want of channels: {missing}")
     return "\n".join(lines)
+
+
+def _other_channels(one: dict[str, Any], names: str) -> str:
+    """That other channels would do as well, or have the line of a tone."""
+    return f"its channel not told from {names}" if "channel" in one["settings"] else f"a line of {names} too"
 
 
 def _short(value: Any) -> str:

@@ -13,8 +13,9 @@ from magtensor.calibration.mixture import likeliest_mixture
 from magtensor.error_models.quiet import quieted
 from magtensor.error_models.terms import joined
 from magtensor.loop.evidence import statistics
-from magtensor.loop.evidence.assessment import block_count, colours_of
+from magtensor.loop.evidence.assessment import colours_of
 from magtensor.loop.evidence.colour import Colour, colour_of
+from magtensor.loop.evidence.folds import block_count
 from magtensor.loop.evidence.gains import Gain
 from magtensor.loop.evidence.grams import grams
 from magtensor.loop.evidence.spectrum import spectral_lines

@@ -12,8 +12,8 @@ from scipy.signal import lfilter
 
 from magtensor.error_models.station import Station
 from magtensor.error_models.terms import joined
-from magtensor.loop.evidence.assessment import block_count
 from magtensor.loop.evidence.colour import colour_of
+from magtensor.loop.evidence.folds import block_count
 from magtensor.loop.evidence.grams import grams
 from magtensor.loop.evidence.own_noise import OwnNoise
 from magtensor.loop.evidence.sensor_noise import smoothed_spectrum

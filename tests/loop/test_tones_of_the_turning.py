@@ -10,7 +10,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from loop_cases import BASE, Array, adopted_names, linear_state, loaded, scenario, verdict_of
+from loop_cases import BASE, Array, adopted_names, linear_state, loaded, scenario, synthetic, verdict_of
 from scipy.signal import StateSpace, lsim
 from scipy.spatial.transform import Rotation
 
@@ -18,7 +18,7 @@ from magtensor.error_models.direction import turning_Hz, turning_lines
 from magtensor.loop.evidence.spectrum import spectral_lines
 from magtensor.loop.fitting.model import Adopted, Fitting
 from magtensor.loop.fitting.refit import joint_state
-from magtensor.loop.remainder.tones import of_the_turning, tones
+from magtensor.loop.remainder.tones import channels_of_the_line, of_the_turning, tones
 from magtensor.loop.searching.overshadowed import _of_the_attitude
 from magtensor.registry import Registry
 
@@ -122,3 +122,29 @@ def test_how_fast_a_platform_turns(tmp_path: Path) -> None:
         x = record.excitation(seen, seen)
         assert turning_Hz(replace(x, attitude=None)) == pytest.approx(expected, abs=1e-5)
         assert turning_Hz(replace(x, attitude=yaw.as_quat())) == pytest.approx(0.02, rel=1e-3)
+
+
+def test_a_tone_may_be_that_of_a_channel_or_of_its_powers() -> None:
+    """A field with the square of a vibration that was logged too late has a line at twice its frequency."""
+    record, rng = synthetic(9), np.random.default_rng(9)
+    wave = np.sin(2.0 * np.pi * 0.0731 * record.time + 1.0) + 0.1 * rng.standard_normal(len(record.time))
+    field = np.repeat(record.raw[:, :1], len(record.sensors), axis=1)
+    logged = {"vibration": 3.0 + wave, "pressure": rng.standard_normal(len(record.time)), "still": 0.0 * wave}
+    x = replace(record.excitation(field, field), logged=logged)
+    assert channels_of_the_line(x, 0.0731) == channels_of_the_line(x, 2.0 * 0.0731) == ("vibration",)
+    assert channels_of_the_line(x, 0.11) == ()
+
+
+def test_channels_with_its_line_are_named_beside_a_tone(tmp_path: Path) -> None:
+    def logged(path: Path) -> None:
+        steady(path, added=motor)
+        with h5py.File(path, "a") as file:
+            time = file["time"][:] - file["time"][0]
+            late = np.cos(2.0 * np.pi * 0.5 * 0.2137 * (time - 1.3))  # half as fast, and no channel of the models tried
+            file["vibration"] = late
+            file["vibration"].dims[0].attach_scale(file["time"])
+            file["vibration"].attrs["units"] = "m s-2"
+
+    told = verdict_of(tmp_path, scenario(75), logged, ["periodic_interference"])
+    (adopted,) = told["adopted"]
+    assert adopted["indistinguishable_from"] == ["channel_response"] and adopted["channels_as_good"] == ["vibration"]

@@ -55,9 +55,12 @@ def turning_Hz(x: Excitation) -> float:
 def turning_lines(x: Excitation, frequencies_Hz: Sequence[float]) -> Array:
     """(F,) the largest amplitude with which the attitude, in units of its own series, has a line at each frequency; 0
     where none of them has. Any law of the attitude has one there, with a memory or without."""
-    if not len(frequencies_Hz):
-        return np.zeros(0)
-    series = attitude_series(x)
+    return largest_lines(attitude_series(x), x, frequencies_Hz) if len(frequencies_Hz) else np.zeros(0)
+
+
+def largest_lines(series: Array, x: Excitation, frequencies_Hz: Sequence[float]) -> Array:
+    """(F,) the largest amplitude with which one of several series (N, K) has a line at each frequency; 0 where none of
+    them has."""
     window = np.blackman(len(series) + 2)[1:-1]
     window /= window.sum()
     series = (series - window @ series) * window[:, None]

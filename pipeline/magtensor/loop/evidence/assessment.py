@@ -10,15 +10,15 @@ import numpy as np
 from magtensor.calibration.types import Array
 from magtensor.error_models.terms import Terms, joined
 from magtensor.loop.evidence.colour import Colour, colour_of
+from magtensor.loop.evidence.folds import Blocks, known_until
 from magtensor.loop.evidence.gains import Gain, focused_gain, held_out_gain
 from magtensor.loop.evidence.grams import Grams, Whitened, grams, grams_in, normal
+from magtensor.loop.evidence.lone_event import elsewhere, left_of
 from magtensor.loop.evidence.own_noise import OwnNoise
 from magtensor.loop.evidence.residual import Residual, taken_off
 from magtensor.loop.evidence.statistics import Estimate, family_p, own_information, solve
 from magtensor.loop.evidence.turned import TurnedColour, excess_of, excess_of_one
 
-FINEST_BLOCKS = 120
-LEAST_PER_BLOCK = 4
 NEARLY_ALL = 0.9  # of what is explained: the average colour of the sensors' noise then has to suit one of them
 SLOWEST = 20  # part of the frequencies that count as slow
 LEAST_SLOWEST = 30
@@ -66,6 +66,7 @@ class Assessment:
 
     Attributes:
         estimate: coefficients, covariance (in noise of the fitted colour), information.
+        parts: the blocks and folds that gains are asked on; of what happened once, where that is over soon, its parts.
         gain: on held-out blocks, in noise whose colour is found when the terms have explained their part.
         null_gain: the same in noise whose colour is found without them: what the null hypothesis says of the noise.
         focused, null_focused: both again on folds that know equally much of the terms, which are short where these act;
@@ -76,11 +77,13 @@ class Assessment:
             the blocks do not bear the test out.
         null_p: that from what they explain in noise of the colour that the residual has without them, stronger where it
             is all in one sensor with more slow noise than the others.
+        left_there: part that they leave of what there was when something happened once and was over soon (`left_of`).
         colours: under the hypothesis that the terms are real.
         theta: the likeliest coefficients, with any colour: where a joint fit begins.
     """
 
     estimate: Estimate
+    parts: Blocks
     gain: Gain
     null_gain: Gain
     focused: Gain | None
@@ -88,13 +91,9 @@ class Assessment:
     p: float
     own_p: float
     null_p: float
+    left_there: float
     colours: Colours
     theta: Array
-
-
-def block_count(samples: int) -> int:
-    """Blocks for a survey of so many samples."""
-    return int(np.clip(samples // LEAST_PER_BLOCK, 1, FINEST_BLOCKS))
 
 
 def assess(now: Whitened, terms: Terms, *, once: bool = False, noise: OwnNoise | None = None) -> Assessment:
@@ -119,22 +118,36 @@ def assess(now: Whitened, terms: Terms, *, once: bool = False, noise: OwnNoise |
     together = terms if given is None else joined([given, terms])
     first = together.count - terms.count
     blocked = np.arange(together.count) < first
-    count = block_count(len(residual.affine))
-    null = grams_in(now, terms, count)
-    null_gain = held_out_gain(null, residual.freedom, blocked)
+    parts = Blocks.of_an_event(terms) if once else Blocks.equal(len(residual.affine))
+    null = grams_in(now, terms, parts.edges)
+    null_gain = held_out_gain(null, residual.freedom, blocked, parts)
     null_focused = focused_gain(null, residual.freedom, blocked)
     best = likeliest(residual, together, [Colours(now.across, now.along), WHITE], _estimate(null).theta)
     colours = best.colours
     sensor = _only_sensor(null, first, terms)
     stronger = slow_noise_of(sensor, taken_off(residual, together, best.theta), now.across)
     null_p = _p_of(null, first, max(stronger, 1.0))
-    blocks = grams(residual, together, colours.across, colours.along, count)
+    blocks = grams(residual, together, colours.across, colours.along, parts.edges)
     by_blocks = 0.0 if once else family_p(blocks, together.sensors, range(first, together.count))
     own_p = (noise or OwnNoise(residual, given)).p_value(terms) if by_blocks < BORNE_OUT else 1.0
     p = own_p if once else by_blocks
-    gain = held_out_gain(blocks, residual.freedom, blocked)
+    gain = held_out_gain(blocks, residual.freedom, blocked, parts)
     focused = focused_gain(blocks, residual.freedom, blocked)
-    return Assessment(_estimate(blocks), gain, null_gain, focused, null_focused, p, own_p, null_p, colours, best.theta)
+    left = _left_there(residual, together, best.theta, first, parts)
+    evidence = (parts, gain, null_gain, focused, null_focused, p, own_p, null_p, left)
+    return Assessment(_estimate(blocks), *evidence, colours, best.theta)
+
+
+def _left_there(residual: Residual, terms: Terms, theta: Array, given: int, parts: Blocks) -> float:
+    """What of something that is over soon is left at its time by all terms but the first `given` ones; 0 of what is
+    not."""
+    if parts.divided == (0, 0):
+        return 0.0
+    after = taken_off(residual, terms, theta)
+    before = taken_off(residual, terms, np.where(np.arange(terms.count) < given, theta, 0.0))
+    noise = colours_of(elsewhere(after, parts), stiff=True)
+    known = known_until(terms.only(range(given, terms.count)))
+    return left_of(before, after, known, noise.across, noise.along, parts)
 
 
 @dataclass(frozen=True)

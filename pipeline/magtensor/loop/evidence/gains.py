@@ -9,13 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtensor.calibration.types import Array
+from magtensor.loop.evidence.folds import FOLDS, Blocks
 from magtensor.loop.evidence.grams import Grams, held_out, normal
 from magtensor.loop.evidence.statistics import LEAST_BLOCKS, own_information, theta_of_each
 
-FOLDS = 10
 INTERLEAVED_FOLDS = 20
 LEAST_T = 2.0  # paired t of the held-out gain over folds
 LEAST_SHARE_OF_FOLDS = 0.8  # a strong slow effect gains unevenly, which keeps t low, but nearly everywhere
+WORSE = 4.0  # standard deviations below the mean of the folds, of the worst of ten
 CONCENTRATED = 0.9  # of what is known, in one fold: the others do not predict it
 
 
@@ -55,23 +56,35 @@ class Gain:
         return self.total > 0 and (self.t > LEAST_T or better >= LEAST_SHARE_OF_FOLDS)
 
     @property
+    def contradicted(self) -> bool:
+        """Whether one of the folds, all of which should gain as much, is made worse by more than chance: if what is
+        true gains G on each, noise makes that scatter by 2 sqrt(G)."""
+        each = self.before - self.after
+        mean = float(each.mean())
+        return bool(each.min() < 0 and mean - each.min() > WORSE * 2.0 * np.sqrt(max(mean, 0.0)))
+
+    @property
     def rms(self) -> tuple[float, float]:
         """Whitened rms before and after."""
         count = float(self.values.sum())
         return float(np.sqrt(self.before.sum() / count)), float(np.sqrt(max(self.after.sum(), 0.0) / count))
 
 
-def held_out_gain(g: Grams, freedom: int, blocked: NDArray[np.bool_] | None = None) -> Gain:
-    """Gain over contiguous folds of equal length, a block's gap between training and test.
+def held_out_gain(
+    g: Grams, freedom: int, blocked: NDArray[np.bool_] | None = None, blocks: Blocks | None = None
+) -> Gain:
+    """Gain over contiguous folds, a block's gap between training and test.
 
     Parameters
     ----------
     g: the finest blocks.
     freedom: residual values a sample.
     blocked: (P,) terms that belong to both models compared.
+    blocks: those of g and their folds; blocks and folds of equal length without.
     """
     count = len(g.zz)
-    return _gain_between(g, freedom, np.linspace(0, count, min(FOLDS, count) + 1).round().astype(int), blocked)
+    edges = blocks.folds if blocks else np.linspace(0, count, min(FOLDS, count) + 1).round().astype(int)
+    return _gain_between(g, freedom, edges, blocked)
 
 
 def focused_gain(g: Grams, freedom: int, blocked: NDArray[np.bool_]) -> Gain | None:

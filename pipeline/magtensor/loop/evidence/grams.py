@@ -172,24 +172,27 @@ class Whitened:
         return cls(residual, across, along, given, known_across, known_along, known_sighted, over_time)
 
     @cached_property
-    def _sums(self) -> dict[int, tuple[Array | None, Array | None, Array | None]]:
+    def _sums(self) -> dict[bytes, tuple[Array | None, Array | None, Array | None]]:
         return {}
 
-    def sums(self, blocks: int) -> tuple[Array | None, Array | None, Array | None]:
+    def sums(self, blocks: int | NDArray[np.int_]) -> tuple[Array | None, Array | None, Array | None]:
         """(B, ., .) products of all that is known across with each other, of all that is along, and sighted."""
-        if blocks not in self._sums:
+        key = self.edges(blocks).tobytes()
+        if key not in self._sums:
             across, along, sighted = (
                 None if k is None else _products(k, k, self.edges(blocks, len(k)))
                 for k in (self.known_across, self.known_along, self.known_sighted)
             )
-            self._sums[blocks] = across, along, sighted
-        return self._sums[blocks]
+            self._sums[key] = across, along, sighted
+        return self._sums[key]
 
-    def edges(self, blocks: int, rows: int | None = None) -> NDArray[np.int_]:
-        """(B + 1,) where blocks begin and end, in samples or in so many rows, as many of each sample."""
-        assert self.over_time or blocks == 1
+    def edges(self, blocks: int | NDArray[np.int_], rows: int | None = None) -> NDArray[np.int_]:
+        """(B + 1,) where blocks of equal length, or those given, begin and end, in samples or in so many rows, as many
+        of each sample."""
+        assert self.over_time or np.ndim(blocks) or blocks == 1
         count = len(self.residual.affine)
-        return np.linspace(0, count, blocks + 1).round().astype(int) * ((rows or count) // count)
+        edges = np.linspace(0, count, blocks + 1).round().astype(int) if isinstance(blocks, int) else blocks
+        return edges * ((rows or count) // count)
 
 
 def _seen_across(terms: Terms) -> float:
@@ -201,13 +204,20 @@ def _products(a: Array, b: Array, edges: NDArray[np.int_]) -> Array:
     return np.stack([a[i:j].T @ b[i:j] for i, j in itertools.pairwise(edges)])
 
 
-def grams(residual: Residual, terms: Terms, across: Colour, along: Colour | TurnedColour, blocks: int = 1) -> Grams:
+def grams(
+    residual: Residual,
+    terms: Terms,
+    across: Colour,
+    along: Colour | TurnedColour,
+    blocks: int | NDArray[np.int_] = 1,
+) -> Grams:
     """Gram matrices of terms evaluated at the residual's samples, in contiguous blocks.
 
     Parameters
     ----------
     terms: their series have the residual's samples as rows.
     across, along: the colours of the two parts of the residual.
+    blocks: how many of equal length, or (B + 1,) samples where they begin and end.
     """
     return grams_in(Whitened.of(residual, across, along), terms, blocks)
 
@@ -215,7 +225,7 @@ def grams(residual: Residual, terms: Terms, across: Colour, along: Colour | Turn
 _Sums = Callable[[Array, Array], tuple[Array, Array]]  # of what is known and what is new (N, .), and of the new alone
 
 
-def grams_in(white: Whitened, terms: Terms | None, blocks: int = 1) -> Grams:
+def grams_in(white: Whitened, terms: Terms | None, blocks: int | NDArray[np.int_] = 1) -> Grams:
     """The same of the terms that are in a whitened residual already, and of more where there are any."""
 
     def sums(known: Array, new: Array) -> tuple[Array, Array]:

@@ -20,7 +20,7 @@ import numpy as np
 from magtensor.calibration.joint import JointFit
 from magtensor.calibration.joint_together import FALSE_REJECTION
 from magtensor.calibration.types import Array, Mask
-from magtensor.loop.evidence.gains import FOLDS
+from magtensor.loop.evidence.folds import FOLDS
 from magtensor.loop.evidence.residual import residual_of
 
 ABOUT = 25  # samples whose median roughness tells how loud the noise is: a dozen that are disturbed do not

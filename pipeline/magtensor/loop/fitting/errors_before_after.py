@@ -14,6 +14,7 @@ from magtensor.calibration.joint import nearest_frame
 from magtensor.calibration.types import Array
 from magtensor.error_models.terms import Terms
 from magtensor.errors import DataError, NotEnoughData
+from magtensor.loop.evidence.folds import NEARLY_ALL, known_until
 from magtensor.loop.fitting.log_noise import channels_of
 from magtensor.loop.fitting.model import Adopted, Fitting, Record, State
 from magtensor.loop.fitting.refit import joint_state, without
@@ -21,7 +22,6 @@ from magtensor.sharing import shared_out
 from magtensor.tensor.assembly import least_squares_assembly
 
 FOLDS = 5
-NEARLY_ALL = 0.95  # of what is known of an effect: by the other folds its coefficients err four times as much
 
 
 def folds_for(state: State) -> NDArray[np.int_]:
@@ -38,7 +38,7 @@ def folds_for(state: State) -> NDArray[np.int_]:
     divided = set(edges.tolist())
     for model in state.adopted:
         terms = model.terms(state.excitation)
-        known = _known_until(terms)
+        known = known_until(terms)
         held = known[edges[2:]] - known[edges[:-2]]
         left = _known_without_each(terms, edges)
         if held.max() > NEARLY_ALL:
@@ -50,13 +50,6 @@ def folds_for(state: State) -> NDArray[np.int_]:
         inner = known[first] + (known[last] - known[first]) * np.arange(1, FOLDS) / FOLDS
         divided.update(np.searchsorted(known, inner).tolist())
     return np.array(sorted(divided))
-
-
-def _known_until(terms: Terms) -> Array:
-    """(N + 1,) part of what is known of a model's coefficients, constants left out, that so many samples know."""
-    square = (terms.series - terms.series.mean(axis=0)) ** 2
-    share = square / np.maximum(square.sum(axis=0), 1e-300)
-    return np.concatenate([[0.0], np.cumsum(share[:, terms.part_series].mean(axis=1))])
 
 
 def _known_without_each(terms: Terms, edges: NDArray[np.int_]) -> Array:

@@ -191,9 +191,12 @@ def unread(adopted: Sequence[Adopted], time: Array) -> NDArray[np.bool_]:
     return time + late > time[-1] if late else np.zeros(len(time), dtype=bool)
 
 
+CHANNEL = "channel_response"  # of a channel that nobody wrote a model for
+
+
 def generic(model: Adopted) -> bool:
     """A model of anything that follows a channel says less than one that names a cause."""
-    return model.name in ("channel_response", "latent_source")
+    return model.name in (CHANNEL, "latent_source")
 
 
 def of_the_site(component: Component) -> bool:

@@ -9,7 +9,8 @@ import numpy as np
 
 from magtensor.error_models.settings import Laws, Orders
 from magtensor.error_models.terms import Terms, joined
-from magtensor.loop.evidence.assessment import Assessment, Colours, block_count
+from magtensor.loop.evidence.assessment import Assessment, Colours
+from magtensor.loop.evidence.folds import Blocks
 from magtensor.loop.evidence.gains import Gain, held_out_gain
 from magtensor.loop.evidence.grams import grams
 from magtensor.loop.fitting.model import Adopted, State
@@ -17,14 +18,16 @@ from magtensor.loop.fitting.model import Adopted, State
 SEPARATION = 9.0  # twice the log likelihood ratio between two models below which the data do not tell them apart
 
 
-def fold_gain(state: State, colours: Colours, *terms: Terms) -> Gain:
-    """What terms gain on held-out folds in noise of given colours, those of the adopted models free."""
+def fold_gain(state: State, colours: Colours, *terms: Terms, parts: Blocks | None = None) -> Gain:
+    """What terms gain on held-out folds, of equal length or given ones, in noise of given colours, those of the adopted
+    models free."""
     given = [] if state.terms is None else [state.terms]
     together = joined([*given, *terms])
     blocked = np.arange(together.count) < sum(t.count for t in given)
-    count = block_count(len(state.residual.affine))
-    blocks = grams(state.residual, together, colours.across, colours.along, count)
-    return held_out_gain(blocks, state.residual.freedom, blocked)
+    samples = len(state.residual.affine)
+    parts = Blocks.equal(samples) if parts is None else parts.among(samples)
+    blocks = grams(state.residual, together, colours.across, colours.along, parts.edges)
+    return held_out_gain(blocks, state.residual.freedom, blocked, parts)
 
 
 def separated(best: Gain, other: Gain, spare: int = 0) -> bool:

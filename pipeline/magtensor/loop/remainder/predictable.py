@@ -9,8 +9,9 @@ from magtensor.error_models.acting import AXES
 from magtensor.error_models.direction import attitude_series, direction_series
 from magtensor.error_models.excitation import Excitation
 from magtensor.error_models.terms import Terms, joined
-from magtensor.loop.evidence.assessment import WHITE, Colours, block_count
-from magtensor.loop.evidence.gains import FOLDS, Gain, held_out_gain
+from magtensor.loop.evidence.assessment import WHITE, Colours
+from magtensor.loop.evidence.folds import FOLDS, block_count
+from magtensor.loop.evidence.gains import Gain, held_out_gain
 from magtensor.loop.fitting.model import State
 
 LEAST_T = 4.5  # one in a thousand by chance: paired t over folds of what the direction predicts

@@ -12,12 +12,13 @@ from collections.abc import Sequence
 import numpy as np
 
 from magtensor.calibration.types import Array
-from magtensor.error_models.direction import turning_lines
+from magtensor.error_models.direction import largest_lines, turning_lines
 from magtensor.error_models.excitation import Excitation
 from magtensor.loop.evidence.spectrum import spectral_lines
 from magtensor.loop.fitting.model import State
 
 MOST = 5  # lines that are looked for tones at
+HARMONICS = 5  # powers of a channel, whose lines its own law may have: a saturation has odd ones
 LARGEST_LAW = 0.01  # of the field, that a law of the attitude makes of an attitude's line
 
 
@@ -33,3 +34,15 @@ def of_the_turning(x: Excitation, frequencies_Hz: Sequence[float], rms_nT: Seque
     total = float(np.median(np.linalg.norm(x.field[:, 0], axis=1)))
     most = LARGEST_LAW * total * turning_lines(x, frequencies_Hz)
     return [np.sqrt(2.0) * rms < largest for rms, largest in zip(rms_nT, most.tolist(), strict=True)]
+
+
+def channels_of_the_line(x: Excitation, frequency_Hz: float) -> tuple[str, ...]:
+    """Logged channels with a line at a frequency, or with a power that has one: what follows such a channel, late or by
+    a law of its own, is not told from a tone."""
+    found = []
+    for name, values in sorted(x.logged.items()):
+        course = (values - values.mean(axis=0)) / np.maximum(values.std(axis=0), 1e-300)
+        powers = np.column_stack([course.reshape(len(course), -1) ** k for k in range(1, HARMONICS + 1)])
+        if largest_lines(powers, x, [frequency_Hz])[0] > 0:
+            found.append(name)
+    return tuple(found)

@@ -13,7 +13,8 @@ from magtensor.calibration.types import Array
 from magtensor.error_models.settings import EventTimes, Frequencies, profiled
 from magtensor.error_models.terms import Terms
 from magtensor.error_models.waveform import NAME
-from magtensor.loop.evidence.assessment import WHITE, Colours, block_count, estimated_in, explained
+from magtensor.loop.evidence.assessment import WHITE, Colours, estimated_in, explained
+from magtensor.loop.evidence.folds import Blocks
 from magtensor.loop.evidence.gains import Gain, concentrated, focused_gain, held_out_gain
 from magtensor.loop.evidence.grams import Grams, Whitened, grams
 from magtensor.loop.evidence.own_noise import OwnNoise
@@ -57,19 +58,39 @@ def held_out(state: State, given: Sequence[int]) -> Gain:
     return held_out_gain(_blocks(state), state.residual.freedom, np.isin(np.arange(state.terms.count), given))
 
 
-def _blocks(state: State, colours: Colours | None = None) -> Grams:
-    """Of the adopted terms and the residual with their part put back, in the finest blocks, in noise of its own colour
-    or another."""
+def _blocks(state: State, colours: Colours | None = None, parts: Blocks | None = None) -> Grams:
+    """Of the adopted terms and the residual with their part put back, in the finest blocks or in others, in noise of
+    its own colour or another."""
     assert state.terms is not None
     back = put_back(state.residual, state.terms, np.concatenate(state.theta))
-    noise = colours or state.colours
-    return grams(back, state.terms, noise.across, noise.along, block_count(len(state.residual.affine)))
+    noise, edges = colours or state.colours, (parts or Blocks.equal(len(state.residual.affine))).edges
+    return grams(back, state.terms, noise.across, noise.along, edges)
+
+
+def _gain_of(state: State, place: int, blocks: Grams, colours: Colours | None = None) -> Gain:
+    """What one of the adopted models gains on held-out folds beside the others: of what happened once, on its parts.
+
+    Parameters
+    ----------
+    blocks: the finest ones, in noise of its own colour or another.
+    """
+    assert state.terms is not None
+    others, freedom = _all_but(state, [place]), state.residual.freedom
+    if not happens_once(state.adopted[place]):
+        return held_out_gain(blocks, freedom, others)
+    parts = Blocks.of_an_event(state.terms.only(np.flatnonzero(~others).tolist()))
+    return held_out_gain(_blocks(state, colours, parts), freedom, others, parts)
 
 
 def removal(state: State, *places: int) -> tuple[float, float]:
     """Held-out rms of the residual in nT, all noise alike, without and with some of the adopted models, the others in
     both."""
-    before, after = held_out_gain(_blocks(state, WHITE), state.residual.freedom, _all_but(state, places)).rms
+    blocks = _blocks(state, WHITE)
+    if len(places) == 1:
+        gain = _gain_of(state, places[0], blocks, WHITE)
+    else:
+        gain = held_out_gain(blocks, state.residual.freedom, _all_but(state, places))
+    before, after = gain.rms
     return before * state.residual.scale, after * state.residual.scale
 
 
@@ -130,7 +151,7 @@ def eliminate(record: Record, state: State, how: Fitting, fixed: int) -> tuple[S
     dropped: list[str] = []
     while len(state.adopted) > fixed:
         assert state.terms is not None
-        tests, freedom = families(state), state.residual.freedom
+        tests = families(state)
         blocks = tests.finest
         parts = slices(state)[fixed:]
         values = [
@@ -139,8 +160,7 @@ def eliminate(record: Record, state: State, how: Fitting, fixed: int) -> tuple[S
             else tests.p_value(range(p.start, p.stop))
             for i, p in enumerate(parts)
         ]
-        order = np.arange(state.terms.count)
-        gains = [held_out_gain(blocks, freedom, (order < p.start) | (order >= p.stop)).total for p in parts]
+        gains = [_gain_of(state, fixed + i, blocks).total for i in range(len(parts))]
         rises = [_rise(state, fixed + i) for i in range(len(parts))]
         unlike = [i for i in range(fixed, len(state.adopted)) if not agrees(state, i) or over_at_once(state, i)]
         if unlike:
@@ -213,10 +233,10 @@ def _rise(state: State, place: int) -> float:
     know equally much are asked, and where only a few blocks know anything it is as if it had happened once.
     """
     others, lasting = _all_but(state, [place]), _lasts(state.adopted[place])
-    blocks, freedom = _blocks(state, WHITE), state.residual.freedom
-    gain = held_out_gain(blocks, freedom, others)
+    blocks = _blocks(state, WHITE)
+    gain = _gain_of(state, place, blocks, WHITE)
     if lasting and concentrated(blocks, others):
-        focused = focused_gain(blocks, freedom, others)
+        focused = focused_gain(blocks, state.residual.freedom, others)
         gain, lasting = focused or gain, focused is not None
     before, after = gain.rms
     return after / before / (1.0 - LEAST_FALL if lasting else 1.0 + WORST_RISE)
@@ -234,7 +254,12 @@ def happens_once(model: Adopted) -> bool:
 
 def a_tone(model: Adopted) -> bool:
     """Whether a model is of a tone, whose frequency is where the spectrum of what is left is strongest."""
-    return any(isinstance(g, Frequencies) for g in profiled(model.component).values())
+    return bool(tones_of(model))
+
+
+def tones_of(model: Adopted) -> list[float]:
+    """Hz of the tones that a model is of."""
+    return [float(model.settings[n]) for n, g in profiled(model.component).items() if isinstance(g, Frequencies)]
 
 
 def agrees(state: State, place: int) -> bool:

@@ -19,6 +19,7 @@ ALPHA = 0.005  # family-wise probability that a clean survey gets an adoption, b
 SECOND_ORDER = 1e-5  # of the sum of squares that is explained: 0.3 % of an effect's size
 OF_THE_LAW = 0.0025  # the same, that the law of an effect may miss: 5 % of its size
 LEAST_REDUCTION = 1e-4  # of the held-out sum of squares: smaller is significant only in very long surveys
+MOST_LEFT = 0.1  # of the square of what there was, when something happened once: a third of its size
 LOG_MARGIN = 1.5  # the noise of a log is known to some per cent
 LOG_DEVIATIONS = 3.0  # of what coefficients gain of it by chance
 
@@ -84,6 +85,11 @@ class Candidate:
         return 0.0 < self.assessment.gain.total <= OF_THE_LAW * self.kin
 
     @property
+    def of_no_shape(self) -> bool:
+        """Whether it leaves too much of what there was when it happened."""
+        return self.assessment.left_there > MOST_LEFT
+
+    @property
     def significant(self) -> bool:
         """Whether noise does not explain it, all that was tried considered.
 
@@ -129,6 +135,8 @@ class Candidate:
         if self.of_the_log or self.of_second_order or self.of_the_law:
             return False
         gain = self.assessment.gain
+        if self.of_no_shape:
+            return False
         reduction = gain.total / max(float(gain.before.sum()), 1e-300)
         return self.significant and (gain.consistent or self.predicts_where_it_acts) and reduction > LEAST_REDUCTION
 
@@ -150,7 +158,7 @@ class Candidate:
         unlikely = self.adjusted_p < self.alpha and self.adjusted_null_p < self.alpha
         if not (unlikely and (channel or happens_once(self.model))) and not self.beyond_own_noise:
             return False
-        return focused.consistent and null.total > 0
+        return focused.consistent and not focused.contradicted and null.total > 0
 
     @property
     def passes(self) -> bool:

@@ -24,7 +24,8 @@ from magtensor.error_models.waveform import NAME, Course, course_of, free_direct
 from magtensor.loop.evidence.assessment import Assessment, estimated
 from magtensor.loop.evidence.colour import beside_the_field
 from magtensor.loop.evidence.factor import Factors, Groups, noise_alone, refitted, with_factor
-from magtensor.loop.evidence.gains import FOLDS, Gain
+from magtensor.loop.evidence.folds import FOLDS, Blocks
+from magtensor.loop.evidence.gains import Gain
 from magtensor.loop.evidence.residual import Residual
 from magtensor.loop.fitting.log_noise import brought_in
 from magtensor.loop.fitting.model import Adopted, Fitting, Record, State
@@ -192,8 +193,9 @@ def tried_source(
     model = Adopted(component, {"noise_nT": [float(f"{v:.4g}") for v in _own_noise(after)]})
     after = replace(after, adopted=(*after.adopted[:-1], model))
     gain = found.gain
-    evidence = Assessment(estimate, gain, gain, None, None, found.p, found.p, found.p, state.colours, estimate.theta)
-    return found, Source(record, after, Candidate(model, 1, terms, evidence, found.p, found.p, found.p, ALPHA))
+    folds, p = Blocks.equal(len(state.residual.affine)), found.p
+    evidence = Assessment(estimate, folds, gain, gain, None, None, p, p, p, 0.0, state.colours, estimate.theta)
+    return found, Source(record, after, Candidate(model, 1, terms, evidence, p, p, p, ALPHA))
 
 
 def _own_noise(state: State) -> Array:

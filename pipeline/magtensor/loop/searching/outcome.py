@@ -171,6 +171,8 @@ def why(candidate: Candidate, winner: Candidate | None) -> str:
         return f"less than 0.3 % of what is adopted, whose next order would explain as much: {figures}"
     if candidate.of_the_law:
         return f"less than 5 % of an adopted effect of the same driver and sensors, whose law may miss it: {figures}"
+    if candidate.of_no_shape:
+        return f"leaves {candidate.assessment.left_there:.0%} of what there was at its time: {figures}"
     if not candidate.beyond_slow_noise:
         return f"slow noise as strong as the residual's own would explain as much: {figures}"
     if not candidate.passes:

@@ -33,13 +33,14 @@ def simplest(best: Candidate, possible: Sequence[Candidate], state: State) -> tu
     slow noise could explain is named, and not chosen before one that it could not.
     """
     colours = best.assessment.colours
-    reference = fold_gain(best.before or state, colours, best.terms)
+    parts = best.assessment.parts
+    reference = fold_gain(best.before or state, colours, best.terms, parts=parts)
     equal: list[Candidate] = [best]
     for other in possible:
         if other is best:
             continue
         spare = max(other.assessment.estimate.rank - best.assessment.estimate.rank, 0)
-        found = fold_gain(other.before or state, colours, other.terms)
+        found = fold_gain(other.before or state, colours, other.terms, parts=parts)
         named = generic(best.model) and not generic(other.model) and _channel(best) == _channel(other)
         behind = reference.over(found).total
         alike = behind <= (OF_THE_LAW if named else SECOND_ORDER) * reference.total
@@ -66,9 +67,9 @@ def containing(best: Candidate, possible: Sequence[Candidate], state: State) -> 
     more = [c for c in possible if c.assessment.gain.total > best.assessment.gain.total + SEPARATION]
     for other in sorted(more, key=lambda c: -c.assessment.gain.total):
         colours = other.assessment.colours
-        before = other.before or state
-        alone = fold_gain(before, colours, other.terms)
-        if fold_gain(before, colours, other.terms, best.terms).total - alone.total < SEPARATION:
+        before, parts = other.before or state, best.assessment.parts
+        alone = fold_gain(before, colours, other.terms, parts=parts)
+        if fold_gain(before, colours, other.terms, best.terms, parts=parts).total - alone.total < SEPARATION:
             return other
     return best
 
@@ -95,10 +96,9 @@ def part_of_a_drift(candidate: Candidate, candidates: Sequence[Candidate], state
     """
     if not happens_once(candidate.model):
         return ""
-    least = candidate.assessment.gain.total
     for other in candidates:
         gain = other.assessment.gain
-        if happens_once(other.model) or generic(other.model) or gain.total < least:
+        if happens_once(other.model) or generic(other.model):
             continue
         if not gain.consistent and other.adjusted_null_p >= other.alpha:
             continue
@@ -111,7 +111,8 @@ def part_of_a_drift(candidate: Candidate, candidates: Sequence[Candidate], state
 def _beside(candidate: Candidate, other: Candidate, state: State) -> tuple[float, float, float]:
     """What another model, a candidate and both together predict, in noise of the colour that the other leaves."""
     each = ([other.terms], [candidate.terms], [other.terms, candidate.terms])
-    whole, own, both = (fold_gain(state, other.assessment.colours, *terms).total for terms in each)
+    colours, parts = other.assessment.colours, candidate.assessment.parts
+    whole, own, both = (fold_gain(state, colours, *terms, parts=parts).total for terms in each)
     return whole, own, both
 
 

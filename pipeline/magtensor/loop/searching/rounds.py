@@ -10,10 +10,10 @@ from magtensor.error_models.excitation import Excitation
 from magtensor.error_models.needs import missing
 from magtensor.errors import DataError
 from magtensor.loop.fitting.log_noise import channels_of
-from magtensor.loop.fitting.model import Fitting, Record, State, generic
+from magtensor.loop.fitting.model import CHANNEL, Fitting, Record, State, generic
 from magtensor.loop.fitting.trial import Trial, on_the_folds_of, per_sample, trial
 from magtensor.loop.remainder.changing_matrix import channel_instead
-from magtensor.loop.remainder.tones import tones
+from magtensor.loop.remainder.tones import channels_of_the_line, tones
 from magtensor.loop.searching.adopting import adopt, narrowed, polished
 from magtensor.loop.searching.beginnings import at_its_limit
 from magtensor.loop.searching.contribution import (
@@ -22,6 +22,7 @@ from magtensor.loop.searching.contribution import (
     happens_once,
     of_all_alike,
     share_of_the_field,
+    tones_of,
     without_models,
 )
 from magtensor.loop.searching.course_of_time import beside_time, rivals_in_time
@@ -240,6 +241,9 @@ def _first_kept(
             refused[chosen.model.name] = f"{name}, which lasts, predicts as much"
             continue
         chosen, channels = nearest(chosen, before.state, models)
+        for frequency in tones_of(chosen.model):
+            if channels := channels_of_the_line(before.state.excitation, frequency):
+                rivals = tuple(sorted({*rivals, CHANNEL}))
         time = beside_time(chosen, before.state)
         if time.refused:
             refused[chosen.model.name] = time.refused
