@@ -98,6 +98,7 @@ def apply(
         "total field as it was read, which fits better than without": "total_field_as_read",
         "extrapolated": "extrapolated",
         "begins anew with this survey": "begins_anew",
+        "taken to begin in equilibrium, which four sensors of known positions would show": "in_equilibrium",
         "NOT taken off, for the lengths of this survey's vectors refute it": "not_on_this_survey",
     }
     told_of = (f"{what}: {attributes[name]}" for what, name in each.items() if name in attributes)
@@ -179,6 +180,7 @@ def apply_and_refine(
         begun_anew,
         cleaned,
         extrapolated,
+        in_equilibrium,
         on_its_clock,
         stored_effects,
         those_here,
@@ -223,6 +225,7 @@ def apply_and_refine(
             "not_taken_off": here.left_in,
             "extrapolated": extrapolated(before, calibration, adopted, origins),
             "begins_anew": begun_anew(adopted, calibration),
+            "in_equilibrium": in_equilibrium(adopted, survey),
             "not_on_this_survey": here.refuted,
         }
         given = corrected(fitted, survey, **words)

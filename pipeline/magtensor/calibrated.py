@@ -95,8 +95,9 @@ def corrected(calibration: ArrayCalibration, survey: Survey, **words: str) -> di
 
     `words` become attributes where they say something: `not_taken_off` names effects that are still in it,
     `extrapolated` those taken off beyond what the calibration has seen, `begins_anew` those of a time that goes on from
-    the calibration's survey to another one as a rule, and with this one began again, `not_on_this_survey` those that
-    the survey's own outputs refute, `total_field_as_read` those of the base station that were left in its total field.
+    the calibration's survey to another one as a rule, and with this one began again, `in_equilibrium` responses that
+    lag and are taken to have begun so, `not_on_this_survey` those that the survey's own outputs refute,
+    `total_field_as_read` those of the base station that were left in its total field.
     """
     raw = np.asarray(survey.values("b_raw"), dtype=float)
     b = calibration.apply(raw)

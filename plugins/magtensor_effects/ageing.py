@@ -126,7 +126,7 @@ def offset_while(
         float, EventTimes(20), Field(description="begin or end of the part, s since the survey's start")
     ] = 0.0,
     until_s: Annotated[
-        float, EventTimes(21), Field(description="the other one, s")
+        float, EventTimes(21, since="time_s"), Field(description="the other one, s")
     ] = 60.0,  # grids without a common time
 ) -> Terms:
     """Each axis's offset is another one between two times: a tool, a telephone or a magnet lay on the platform.

@@ -153,3 +153,14 @@ def test_a_beginning_at_its_limit_is_none(part: float, limit: bool, tmp_path: Pa
     settings = {"order": 1, "channel": "temperature", "lag_s": 60.0, "delayed": False, "at_start": part * widest}
     assert at_its_limit(model, settings, x) is limit
     assert not at_its_limit(model, settings | {"lag_s": 5.0, "delayed": True}, x)  # a delay has no beginning
+
+
+@pytest.mark.parametrize("sensors", [3, 4])
+def test_what_is_taken_to_begin_in_equilibrium_is_told(sensors: int, tmp_path: Path) -> None:
+    array = [[0.25, 0.0, 0.0], [-0.25, 0.0, 0.0], [0.0, 0.25, 0.0], [0.0, -0.25, 0.1]][:sensors]
+    instrument = BASE["instrument"] | {"array": {"positions_m": array}}
+    effect = {"type": "temperature_offset", "lag_s": TAU_S, "rms_nT": 3.0}
+    first, second = (scenario(day, effect, instrument=instrument, start=f"2026-03-{day}T09:00:00Z") for day in (21, 22))
+    done = close_loop(survey_file(tmp_path, first), search=["temperature_offset"])
+    there = done.calibration.apply(survey_file(tmp_path, second, "second.h5"))["calibrated/b"].attrs
+    assert there.get("in_equilibrium") == (None if sensors == 4 else "temperature_offset")

@@ -238,14 +238,26 @@ class EventTimes:
 
     Attributes:
         count: how many.
+        since: the setting of the time at which that began which ends then, for parts of the survey that are too short
+            for two grids.
     """
 
     count: int = 60
+    since: str = ""
 
     def values(self, x: Excitation) -> list[Any]:
         """The grid for a survey."""
         edges = np.linspace(0.0, x.duration, self.count + 2)[1:-1]
         return [float(v) for v in edges]
+
+    def short_parts(self, x: Excitation) -> list[tuple[float, float]]:
+        """Where parts as long as the grid's spacing, half and a quarter of it begin and end, every half of a part."""
+        found = []
+        for k in range(3):
+            length = x.duration / (self.count + 1) / 2**k
+            begins = np.arange(0.5 * length, x.duration - 1.4 * length, 0.5 * length)
+            found += [(float(begin), float(begin + length)) for begin in begins]
+        return found
 
 
 @dataclass(frozen=True)

@@ -33,14 +33,14 @@ def as_begun_here(
     """Effects with their coefficients, as they are on a survey that began otherwise than the calibration's."""
     begun = [(a, _tone_here(record, calibration, a, t) if a.name == TONE else t) for a, t in own]
     for number, (model, theta) in enumerate(begun):
-        names = _unknown(model)
+        names = unknown(model)
         if names:
             state = _state_here(record, calibration, begun, number, names)
             begun[number] = replace(model, settings={**model.settings, **state}), theta
     return begun
 
 
-def _unknown(model: Adopted) -> list[str]:
+def unknown(model: Adopted) -> list[str]:
     """The settings that say what a model began with, if that is not known; else none."""
     grids = profiled(model.component).items()
     return [n for n, g in grids if isinstance(g, Beginning) and np.isnan(model.settings.get(n, 0.0))]

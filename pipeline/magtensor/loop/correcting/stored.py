@@ -16,7 +16,7 @@ from magtensor.error_models.needs import FACTS
 from magtensor.error_models.settings import NOT_KNOWN, AnyChannel, Beginning, Duration, EventTimes, profiled
 from magtensor.error_models.waveform import NAME
 from magtensor.errors import DataError, UsageError
-from magtensor.loop.correcting.another_survey import TONE, begins_anew, shows_a_state
+from magtensor.loop.correcting.another_survey import TONE, begins_anew, shows_a_state, unknown
 from magtensor.loop.correcting.correction import corrected_raw, corrected_reference, hidden_objection
 from magtensor.loop.correcting.lengths import AVERAGING, averaged_otherwise
 from magtensor.loop.fitting.model import Adopted, Record, unread
@@ -119,6 +119,14 @@ def begun_anew(adopted: Sequence[Adopted], calibration: Survey) -> str:
     if not adopted or "start" not in calibration["calibration/effects"].attrs:  # nothing says when that was
         return ""
     return ", ".join(dict.fromkeys(a.name for a in adopted if _of_a_time(a) and a.start is None))
+
+
+def in_equilibrium(adopted: Sequence[Adopted], survey: Survey) -> str:
+    """Which responses that lag are taken to begin in equilibrium, for the survey does not show what they began with; ""
+    where none is."""
+    if shows_a_state(survey.values("b_raw"), "position" in survey):
+        return ""
+    return ", ".join(dict.fromkeys(a.name for a in adopted if unknown(a)))
 
 
 @dataclass(frozen=True)

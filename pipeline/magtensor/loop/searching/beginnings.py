@@ -44,6 +44,13 @@ def extent(model: Component, settings: Mapping[str, Any], x: Excitation) -> floa
     return WIDEST * float(np.ptp(x.channel(grid.pick(x, str(settings[name]))), axis=0).max())
 
 
+def began_with_a_vector(model: Adopted) -> bool:
+    """Whether a response that has no channel began with a vector of its own, as iron does: where it lags by as much as
+    the survey lasts, that vector with its coefficients is a C that drifts, by any law."""
+    found = beginning(model.component, model.settings)
+    return found is not None and len(found[0]) > 1 and any(model.settings[name] for name in found[0])
+
+
 def at_its_limit(model: Component, settings: Mapping[str, Any], x: Excitation) -> bool:
     """Whether a response began as far out of equilibrium as it may at most: then something else dies away."""
     found = beginning(model, settings)

@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from magtensor.error_models.waveform import NAME
 from magtensor.loop.fitting.model import Fitting, Record, State
+from magtensor.loop.searching.contribution import removal
 from magtensor.loop.searching.gates import Candidate
 from magtensor.loop.searching.latent import Sought
 
@@ -65,3 +67,14 @@ class Search:
     def told(self) -> State:
         """The state by which it is told what is left."""
         return self.evenly or self.last
+
+
+def without_and_with(found: Search, *places: int) -> tuple[float, float]:
+    """Held-out rms of the residual in nT without and with some of the adopted models, the others in both; of a source
+    that nobody logged, whose waveform has seen the data since, as it was when it was adopted."""
+    if [found.last.adopted[place].name for place in places] == [NAME]:
+        for step in reversed(found.steps):
+            if step.adopted is not None and step.adopted.model.name == NAME:
+                before, after = step.adopted.assessment.gain.rms
+                return before * step.before.residual.scale, after * step.before.residual.scale
+    return removal(found.told, *places)

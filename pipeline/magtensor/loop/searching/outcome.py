@@ -9,8 +9,8 @@ import numpy as np
 from magtensor.error_models.settings import Beginning, EventTimes, Forms, Frequencies, Range, profiled
 from magtensor.error_models.waveform import NAME
 from magtensor.loop.fitting.model import Adopted, Record
-from magtensor.loop.searching.contribution import happens_once, removal
-from magtensor.loop.searching.found import Search, Step
+from magtensor.loop.searching.contribution import happens_once
+from magtensor.loop.searching.found import Search, Step, without_and_with
 from magtensor.loop.searching.gates import Candidate
 
 
@@ -92,9 +92,7 @@ def _adopted(found: Search, index: int) -> dict[str, Any]:
     names, sensors = state.terms.names[part], state.terms.sensors[part]
     units = state.terms.units[part]
     step = _step_of(found, model)
-    before, after = removal(found.told, index)
-    if step is not None and step.adopted is not None and model.name == NAME:  # its waveform has seen the data
-        before, after = (rms * step.before.residual.scale for rms in step.adopted.assessment.gain.rms)
+    before, after = without_and_with(found, index)
     rivals = [] if step is None else list(step.rivals)
     p = float("nan") if step is None or step.adopted is None else step.adopted.assessment.p
     return {

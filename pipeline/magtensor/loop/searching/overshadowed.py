@@ -6,7 +6,8 @@ predicts held-out blocks, and is wrong elsewhere: of the five components of a gr
 quadratic nonlinearity. So an adopted effect that follows the attitude and explains less than what stays unexplained is
 taken out again. So is a tone that may be a harmonic of how the platform turns; and so is what happened once, where more
 of the kind beside it is significant and predicts nothing, as where a sensor wanders, or where the sensors share a
-waveform that has no name and is larger, or switches along the same vectors: a step or a passage may be a part of it.
+waveform that has no name and is larger, or switches along the same vectors: a step or a passage may be a part of it;
+and a source that nobody logged, whose waveform may be a small part of any law that has no name.
 """
 
 from __future__ import annotations
@@ -25,8 +26,8 @@ from magtensor.loop.evidence.residual import taken_off
 from magtensor.loop.fitting.log_noise import channels_of
 from magtensor.loop.fitting.model import Adopted, State
 from magtensor.loop.remainder.predictable import enough_for_the_total_field, predictable_in_the_total_field
-from magtensor.loop.searching.contribution import happens_once, removal, slices
-from magtensor.loop.searching.found import Search
+from magtensor.loop.searching.contribution import happens_once, slices
+from magtensor.loop.searching.found import Search, without_and_with
 from magtensor.loop.searching.unexplained import unexplained, unlikely
 
 MOSTLY = 0.5  # of what an effect adds: so much of it, predicted from the attitude, follows the attitude
@@ -43,13 +44,14 @@ def overshadowed(found: Search, fixed: int) -> tuple[list[int], str] | None:
     if (part := _of_an_adopted_source(state, fixed)) is not None:
         return part
     for places in _of_one_name(state, fixed):
-        before, after = removal(state, *places)
+        before, after = without_and_with(found, *places)
         amount = float(np.sqrt(max(before**2 - after**2, 0.0)))
         if amount >= left * (NAMELESS if _follows_a_vector(state, places) else 1.0) or (
             weakest is not None and amount >= weakest[0]
         ):
             continue
-        if why := _of_the_attitude(state, places) or _of_what_wanders(found, state, places):
+        why = _of_any_law(state, places) or _of_the_attitude(state, places)
+        if why := why or _of_what_wanders(found, state, places):
             weakest = amount, places, why
     several = _of_one_that_switches(state, fixed)
     present = (weakest or several) is not None and bool(unexplained(found, found.record)["present"])
@@ -72,6 +74,11 @@ def _frequency(model: Adopted) -> float:
     """Hz, of a tone; else 0."""
     marks = profiled(model.component).items()
     return next((float(model.settings[name]) for name, mark in marks if isinstance(mark, Frequencies)), 0.0)
+
+
+def _of_any_law(state: State, places: Sequence[int]) -> str:
+    """That a source which nobody logged may be a part of what has another law: a waveform may be anything."""
+    return "has a waveform that may be any law's" if state.adopted[places[0]].name == NAME else ""
 
 
 def _of_the_attitude(state: State, places: Sequence[int]) -> str:

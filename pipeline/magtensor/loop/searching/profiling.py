@@ -51,11 +51,16 @@ def of_ratios(grid: Any) -> bool:
 
 
 def settings_grid(model: Component, x: Excitation) -> list[dict[str, Any]]:
-    """Every combination of the grids of a model's settings."""
-    grids = {name: mark.values(x) for name, mark in profiled(model).items()}
+    """Every combination of the grids of a model's settings, and parts of the survey that are shorter than these."""
+    marks = profiled(model)
     combinations: list[dict[str, Any]] = [{}]
-    for name, values in grids.items():
-        combinations = [{**c, name: v} for c in combinations for v in values]
+    for name, mark in marks.items():
+        combinations = [{**c, name: v} for c in combinations for v in mark.values(x)]
+    for name, mark in marks.items():
+        if isinstance(mark, EventTimes) and mark.since:
+            first = combinations[0]
+            rest = [c for c in combinations if c[name] == first[name] and c[mark.since] == first[mark.since]]
+            combinations += [{**c, mark.since: begin, name: end} for begin, end in mark.short_parts(x) for c in rest]
     return combinations
 
 

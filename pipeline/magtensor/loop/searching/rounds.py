@@ -15,7 +15,7 @@ from magtensor.loop.fitting.trial import Trial, on_the_folds_of, per_sample, tri
 from magtensor.loop.remainder.changing_matrix import channel_instead
 from magtensor.loop.remainder.tones import channels_of_the_line, tones
 from magtensor.loop.searching.adopting import adopt, narrowed, polished
-from magtensor.loop.searching.beginnings import at_its_limit
+from magtensor.loop.searching.beginnings import at_its_limit, began_with_a_vector
 from magtensor.loop.searching.contribution import (
     agrees,
     eliminate,
@@ -301,7 +301,8 @@ def _kept(record: Record, before: Trial, chosen: Candidate, how: Fitting) -> tup
     if (slow or channels) and of_all_alike(after.state, which):
         drift = "drifts" if slow else f"follows {' and '.join(channels)}"
         return None, f"fitted, all sensors show it alike: an error of the base station that {drift} would look the same"
-    if hardly_begun(model, x) and not slow and chosen.moved is None:  # of two of a kind one may be slow
+    if hardly_begun(model, x) and ((not slow and chosen.moved is None) or began_with_a_vector(model)):
+        # of two of a kind one may be slow, and so may what was so at first sight, unless it is all that dies away
         return None, "fitted, it lags by more than half of the survey: any drift would do as well"
     if at_its_limit(model.component, model.settings, after.state.excitation):
         return None, "fitted, it would have begun as far from what it follows as is possible: something else dies away"

@@ -80,6 +80,8 @@ def search(
         name = found.last.adopted[places[0]].name
         if say is not None:
             say(f"taking {name} out again")
+        if name == NAME:
+            record = replace(record, waveform=None)
         record, state = renewed(record, without_models(record, found.last, places, how), how)
         state, steps = _weighed_once_more(record, state, steps, how, len(declared))
         state, dropped = borne_out(record, state, how, len(declared))
