@@ -92,6 +92,7 @@ def test_a_survey_whose_second_half_is_louder_is_calibrated_with_the_first(tmp_p
     assert 0.9 < told["error"]["held_out"]["after"]["total_field_rms_nT"]["all"] / np.hypot(0.15, 0.1) < 1.15
 
 
+@pytest.mark.long
 def test_what_is_shown_in_the_loud_part_alone_is_no_reason_to_leave_it_out(tmp_path: Path) -> None:
     """A pump that shakes everything while its current runs."""
 

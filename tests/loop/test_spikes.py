@@ -47,9 +47,8 @@ def test_neither_blocks_held_out_nor_another_survey_see_them(tmp_path: Path) -> 
         assert len(off) > 2300 and np.sqrt(np.mean(off**2)) < 0.3 and np.abs(off).max() < 3.0
 
 
-@pytest.mark.parametrize(
-    "name", ["averaging", *(pytest.param(name, marks=pytest.mark.long) for name in ("eddy_current", "hysteresis"))]
-)
+@pytest.mark.long
+@pytest.mark.parametrize("name", ["averaging", "eddy_current", "hysteresis"])
 def test_what_follows_the_turning_is_found_beside_spikes(tmp_path: Path, name: str) -> None:
     told = verdict_of(tmp_path, scenario(51, {"type": name, "rms_nT": 10.0}), spiked, lasting_effects())
     assert name in suspects(told) and len(told["adopted"]) == 1, told["unexplained"]["description"]

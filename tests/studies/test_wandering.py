@@ -13,6 +13,7 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "studies"))
 import wandering
 
 
+@pytest.mark.long
 def test_a_thermometer_seen_through_hours_is_no_cause_of_what_all_sensors_show_alike() -> None:
     """Its course, 6900 s late, followed the wandering by chance and explained more than any drift."""
     row = wandering.tried(wandering.Trial("base station", "tumbling", 1000.0, 0.2, 5000))
