@@ -84,7 +84,8 @@ def test_a_small_part_of_what_failed_is_no_candidate() -> None:
     )
 
     def of(*which: int) -> Any:
-        return SimpleNamespace(terms=terms.only(which), assessment=SimpleNamespace(colours=state.colours))
+        assessment = SimpleNamespace(colours=state.colours, parts=None)
+        return SimpleNamespace(terms=terms.only(which), assessment=assessment)
 
     failed = of(0, 1, 2)
     assert rivals.part_of(of(0), failed, state)
@@ -186,7 +187,7 @@ def test_what_gives_way_is_told_whether_it_explained_less(
     def candidate(name: str, gain: float) -> Any:
         figures = SimpleNamespace(gain=SimpleNamespace(total=gain, t=5.0))
         passing = {"significant": True, "beyond_slow_noise": True, "passes": True, "alpha": 0.005}
-        refused = {"of_the_log": False, "of_second_order": False, "of_the_law": False, "log_noise": 0.0}
+        refused = dict.fromkeys(("of_the_log", "of_second_order", "of_the_law", "of_no_shape", "log_noise"), False)
         p = {"adjusted_p": 1e-9, "adjusted_own_p": 1e-9}
         return SimpleNamespace(model=SimpleNamespace(name=name), assessment=figures, **passing, **refused, **p)
 

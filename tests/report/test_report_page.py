@@ -288,7 +288,7 @@ def test_the_loops_findings_are_shown(whole_survey: Survey, written: Write) -> N
     better["total_field_rms_nT"]["all"] = 0.0321
     outcome = verdict(whole_survey) | {
         "adopted": [
-            {"error_model": "temperature_offset", "sensors": ["S1"], "settings": {"lag_s": 118.0},
+            {"error_model": "temperature_offset", "sensors": ["S1"], "settings": {"channel": "air", "lag_s": 118.0},
              "coefficients": [{"name": "x", "sensor": "S1", "value": 1.02, "std": 0.004, "units": "nT/degC"}],
              "evidence": {"z": 11.8}, "indistinguishable_from": ["warm_up"], "channels_as_good": ["box_degC"]}
         ],
@@ -300,8 +300,8 @@ def test_the_loops_findings_are_shown(whole_survey: Survey, written: Write) -> N
     }  # fmt: skip
     text = words(parsed(write_report(written(whole_survey, outcome=outcome))))
     for expected in (
-        "temperature_offset", "lag_s: 118", "S1 x: 1.0200 ± 0.0040 nT/degC", "warm_up", "eddy_current: no gain",
-        "bandwidth, warm_up: screened", "nor its channel from box_degC",
+        "temperature_offset", "lag_s: 118", "channel: air", "S1 x: 1.0200 ± 0.0040 nT/degC", "warm_up",
+        "eddy_current: no gain", "bandwidth, warm_up: screened", "nor its channel from box_degC",
         "current_field: the survey has no current_*", "a line at 0.5 Hz in S2", "0.21 nT rms above the noise",
         "held-out blocks: declared model", "held-out blocks: with adopted effects", "0.0321",
     ):  # fmt: skip

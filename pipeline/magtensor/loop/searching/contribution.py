@@ -254,7 +254,7 @@ def happens_once(model: Adopted) -> bool:
 
 def a_tone(model: Adopted) -> bool:
     """Whether a model is of a tone, whose frequency is where the spectrum of what is left is strongest."""
-    return bool(tones_of(model))
+    return any(isinstance(g, Frequencies) for g in profiled(model.component).values())
 
 
 def tones_of(model: Adopted) -> list[float]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -51,17 +51,21 @@ def of_ratios(grid: Any) -> bool:
 
 
 def settings_grid(model: Component, x: Excitation) -> list[dict[str, Any]]:
-    """Every combination of the grids of a model's settings, and parts of the survey that are shorter than these."""
-    marks = profiled(model)
+    """Every combination of the grids of a model's settings."""
     combinations: list[dict[str, Any]] = [{}]
-    for name, mark in marks.items():
+    for name, mark in profiled(model).items():
         combinations = [{**c, name: v} for c in combinations for v in mark.values(x)]
-    for name, mark in marks.items():
-        if isinstance(mark, EventTimes) and mark.since:
-            first = combinations[0]
-            rest = [c for c in combinations if c[name] == first[name] and c[mark.since] == first[mark.since]]
-            combinations += [{**c, mark.since: begin, name: end} for begin, end in mark.short_parts(x) for c in rest]
     return combinations
+
+
+def short_parts(model: Component, grid: Sequence[dict[str, Any]], x: Excitation) -> list[dict[str, Any]]:
+    """The same with parts of the survey too short for two grids of times; none of other models."""
+    found: list[dict[str, Any]] = []
+    for name, mark in profiled(model).items():
+        if isinstance(mark, EventTimes) and mark.since:
+            rest = [c for c in grid if c[name] == grid[0][name] and c[mark.since] == grid[0][mark.since]]
+            found += [{**c, mark.since: begin, name: end} for begin, end in mark.short_parts(x) for c in rest]
+    return found
 
 
 def already(adopted: Iterable[Adopted], model: Component, settings: Mapping[str, Any]) -> bool:
@@ -141,16 +145,19 @@ def thinned(state: State, most: int) -> tuple[Residual, Terms | None]:
 
 def best_settings(
     model: Component, state: State, few: Thinned, failed: dict[str, str], alpha: float
-) -> list[tuple[dict[str, Any], float]]:
+) -> list[tuple[dict[str, Any], float, bool]]:
     """The settings that explain most in white noise and in noise of the residual's own colour, if they differ.
 
     In white noise what is slow decides, in coloured noise what is fast. Beside each the number of independent tests
-    that all settings amount to. Neighbouring times of an event differ by the noise of a single sample, so that refining
-    them amounts to many more: on clean surveys some five to ten times as many for each time.
+    that all settings amount to, and whether they are of a short part of the survey: what lasts no longer is fast, and
+    the best of it comes beside the others. Neighbouring times of an event differ by the noise of a single sample, so
+    that refining them amounts to many more: on clean surveys some five to ten times as many for each time.
     """
     grid = [g for g in settings_grid(model, state.excitation) if not already(state.adopted, model, g)]
     if len(grid) == 1:
-        return [(grid[0], 1.0)]
+        return [(grid[0], 1.0, False)]
+    long = len(grid)
+    grid += short_parts(model, grid, state.excitation)
     scores: list[tuple[float, float, dict[str, Any]]] = []
     chain: list[float] = []
     last: Array | None = None
@@ -169,8 +176,12 @@ def best_settings(
         return []
     times = sum(isinstance(g, EventTimes) for g in profiled(model).values())
     tried = effective_tests(chain, alpha) * BETWEEN_TIMES**times
-    best = max(scores, key=lambda s: s[0])[2], max(scores, key=lambda s: s[1])[2]
-    return [(settings, tried) for settings in (best[:1] if best[0] is best[1] else best)]
+    lasting, short = ([s for s in scores if any(s[2] is g for g in some)] for some in (grid[:long], grid[long:]))
+    found = []
+    if lasting:
+        best = max(lasting, key=lambda s: s[0])[2], max(lasting, key=lambda s: s[1])[2]
+        found = [(settings, tried, False) for settings in (best[:1] if best[0] is best[1] else best)]
+    return [*found, (max(short, key=lambda s: s[1])[2], tried, True)] if short else found
 
 
 def _batches(made: Iterable[tuple[dict[str, Any], Terms]]) -> Iterator[list[tuple[dict[str, Any], Terms]]]:
