@@ -6,9 +6,11 @@ No two places have the same variation, and no sensor keeps its offset. Each tria
 simulated as for loop_power.md (four sensors with 0.15 nT of white noise each axis and 1/f noise, half an hour of
 tumbling or of turning with tilts within 40 degrees, or 136 static postures), to which a smooth wandering is added, to
 the base station's readings, to the axes of one sensor or to those of all: white noise through two first-order lags of
-the time given, scaled to the rms given, each axis its own. It goes through the whole search, with every error model.
+the time given, scaled to the rms given, each axis its own. Or it is restless for a while: the same under a parabola
+eight times that time wide, somewhere in the survey. It goes through the whole search, with every error model.
 
-- **event**: something that happens once was adopted, a jump or a passing source. There is none.
+- **event**: something that happens once was adopted, a jump or a passing source. There is none; where it was restless
+  for a while one smooth swing is like a vehicle that passes.
 - **slow**: of the base station a drift, a clock or a scale factor of the reference, of sensors a drift of offsets or a
   warming up, which is what it is, or nearly so.
 - **other**: anything else was adopted, which would have another cause.
@@ -18,6 +20,7 @@ the time given, scaled to the rms given, each axis its own. It goes through the 
 from __future__ import annotations
 
 import argparse
+import itertools
 import os
 import sys
 from collections import Counter
@@ -43,10 +46,12 @@ from magtensor.loop.searching.unexplained import unexplained
 from magtensor.registry import Registry
 from magtensor.simulate import simulate
 
-TIMES_S = (30.0, 100.0, 300.0, 1000.0)
-RMS_NT = (0.05, 0.1, 0.2)
+TIMES_S, RMS_NT = (30.0, 100.0, 300.0, 1000.0), (0.05, 0.1, 0.2)
+RESTLESS_S, RESTLESS_NT = (5.0, 15.0, 40.0), (0.5, 2.0)
+FOR_A_WHILE = ", for a while"
+WIDTH = 8.0  # times the time of the lags, in which it is restless
 KINDS = ("event", "slow", "other", "told", "silent")
-WHO = ("base station", "one sensor", "all sensors")
+WHO = ("base station", "one sensor", "all sensors", f"base station{FOR_A_WHILE}", f"one sensor{FOR_A_WHILE}")
 DRIFTS = ("offset_drift", "warm_up")
 FIRST_SEED = 6000  # 5000 to 5001 are those on which it was found what thermometers seen through hours are taken for
 
@@ -70,16 +75,21 @@ def models() -> list[Component]:
 
 def wander(path: Path, trial: Trial) -> None:
     """Add the wandering to a survey's file."""
-    rng = np.random.default_rng([trial.seed, round(trial.time_s), round(1e3 * trial.rms_nT)])
+    rng = np.random.default_rng(seeds_of(trial))
     with h5py.File(path, "a") as file:
-        if trial.who == "base station":
+        if trial.who.startswith("base station"):
             readings = file["reference/total_field"]
             readings[:] = readings[:] + course(rng, trial, file["reference/time"][:])
             return
         outputs = file["b_raw"]
-        for sensor in range(1 if trial.who == "one sensor" else outputs.shape[1]):
+        for sensor in range(1 if trial.who.startswith("one sensor") else outputs.shape[1]):
             for axis in range(3):
                 outputs[:, sensor, axis] = outputs[:, sensor, axis] + course(rng, trial, file["time"][:])
+
+
+def seeds_of(trial: Trial) -> list[int]:
+    """Of its wandering."""
+    return [trial.seed, round(trial.time_s), round(1e3 * trial.rms_nT)]
 
 
 def course(rng: np.random.Generator, trial: Trial, time: Array) -> Array:
@@ -90,7 +100,12 @@ def course(rng: np.random.Generator, trial: Trial, time: Array) -> Array:
     for _ in range(2):
         out = lfilter([1.0 - keep], [1.0, -keep], out)
     out = np.interp(time - time[0], even, out)
-    return np.asarray(trial.rms_nT * (out - out.mean()) / out.std())
+    if not trial.who.endswith(FOR_A_WHILE):
+        return np.asarray(trial.rms_nT * (out - out.mean()) / out.std())
+    middle = np.random.default_rng([*seeds_of(trial), 1]).uniform(0.15, 0.85) * np.ptp(time)
+    window = np.maximum(1.0 - ((time - time[0] - middle) / (WIDTH / 2.0 * trial.time_s)) ** 2, 0.0)
+    within = (out - np.average(out, weights=window)) * window
+    return np.asarray(trial.rms_nT * within / np.sqrt(np.average(within**2, weights=window)))
 
 
 def tried(trial: Trial) -> dict[str, Any]:
@@ -110,7 +125,7 @@ def tried(trial: Trial) -> dict[str, Any]:
 
 def slow(adopted: Adopted, who: str) -> bool:
     """Whether it is what wanders, or nearly so."""
-    return adopted.component.effect == "reference" if who == "base station" else adopted.name in DRIFTS
+    return adopted.component.effect == "reference" if who.startswith("base station") else adopted.name in DRIFTS
 
 
 def line(row: dict[str, Any]) -> str:
@@ -126,6 +141,11 @@ def counted(kinds: Sequence[str]) -> str:
     return " | ".join(str(counts[kind]) for kind in KINDS)
 
 
+def strengths(who: str) -> tuple[Sequence[float], Sequence[float]]:
+    """The times, s, and rms, nT, of what wanders."""
+    return (RESTLESS_S, RESTLESS_NT) if who.endswith(FOR_A_WHILE) else (TIMES_S, RMS_NT)
+
+
 def page(command: str, rows: Sequence[dict[str, Any]], open_: int) -> str:
     """The study's page."""
     words = (__doc__ or "").split("\n\n", 2)[2]
@@ -135,7 +155,7 @@ def page(command: str, rows: Sequence[dict[str, Any]], open_: int) -> str:
     lines += [f"| what wanders | motion | rms, nT | surveys | {' | '.join(KINDS)} |", "|" + "---|" * (4 + len(KINDS))]
     for who in WHO:
         for motion in MOTIONS:
-            for rms in RMS_NT:
+            for rms in strengths(who)[1]:
                 own = [r["kind"] for r in rows if (r["who"], r["motion"], r["rms_nT"]) == (who, motion, rms)]
                 if own:
                     lines.append(f"| {who} | {motion} | {rms:g} | {len(own)} | {counted(own)} |")
@@ -149,10 +169,9 @@ def planned(seeds: int) -> Iterator[Trial]:
     """All trials, every kind of survey before a second one of any."""
     for seed in range(FIRST_SEED, FIRST_SEED + seeds):
         for who in WHO:
-            for motion in MOTIONS:
-                for rms in RMS_NT:
-                    for time_s in TIMES_S:
-                        yield Trial(who, motion, time_s, rms, seed)
+            times, strong = strengths(who)
+            for motion, rms, time_s in itertools.product(MOTIONS, strong, times):
+                yield Trial(who, motion, time_s, rms, seed)
 
 
 def main() -> None:

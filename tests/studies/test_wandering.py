@@ -34,6 +34,15 @@ def test_each_axis_wanders_by_itself_and_by_what_is_asked() -> None:
     assert np.diff(one).std() < 0.02  # smooth
 
 
+def test_what_is_restless_for_a_while_is_still_elsewhere() -> None:
+    trial = wandering.Trial(f"one sensor{wandering.FOR_A_WHILE}", "tumbling", 15.0, 2.0, 7)
+    time = np.arange(0.0, 1800.0, 0.5)
+    out = wandering.course(np.random.default_rng(1), trial, time)
+    acts = np.flatnonzero(out)
+    assert np.ptp(time[acts]) == pytest.approx(8 * 15.0, abs=1.0)
+    assert 0.5 < out[acts].std() < 2.5 and np.abs(np.diff(out)).max() < 1.0
+
+
 def test_the_page_names_what_is_accused_wrongly() -> None:
     row = {
         "who": "all sensors",
