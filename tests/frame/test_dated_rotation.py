@@ -59,6 +59,7 @@ def applied(folder: Path, calibration: Path, name: str, *options: str) -> xr.Dat
         return found.load()
 
 
+@pytest.mark.long
 def test_the_change_is_the_same_in_any_frame(folder: Path) -> None:
     free, tied = (open_result(folder / name / "calibration.nc") for name in ("free", "tied"))
     assert tied["calibration/matrix"].attrs["frame"].startswith("platform")

@@ -155,7 +155,7 @@ def test_a_beginning_at_its_limit_is_none(part: float, limit: bool, tmp_path: Pa
     assert not at_its_limit(model, settings | {"lag_s": 5.0, "delayed": True}, x)  # a delay has no beginning
 
 
-@pytest.mark.parametrize("sensors", [3, 4])
+@pytest.mark.parametrize("sensors", [3, pytest.param(4, marks=pytest.mark.long)])
 def test_what_is_taken_to_begin_in_equilibrium_is_told(sensors: int, tmp_path: Path) -> None:
     array = [[0.25, 0.0, 0.0], [-0.25, 0.0, 0.0], [0.0, 0.25, 0.0], [0.0, -0.25, 0.1]][:sensors]
     instrument = BASE["instrument"] | {"array": {"positions_m": array}}

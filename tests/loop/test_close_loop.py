@@ -164,6 +164,7 @@ def test_wrong_options(options: dict[str, object], words: str, surveys: tuple[Pa
         magtensor.close_loop(surveys[0], **options)  # type: ignore[arg-type]
 
 
+@pytest.mark.long
 def test_a_declared_drift_is_known_as_long_as_the_survey(surveys: tuple[Path, Path]) -> None:
     """Over an hour, of which it has seen ten minutes, it would be extrapolated wherever it is applied."""
     for declared, span_s in ((["offset_drift"], 599.5), ({"offset_drift": {"span_s": 900.0}}, 900.0)):
@@ -199,7 +200,9 @@ JUMPS: dict[str, dict[str, Any]] = {
 }
 
 
-@pytest.mark.parametrize("effect", JUMPS)
+@pytest.mark.parametrize(
+    "effect", ["turn_step", *(pytest.param(e, marks=pytest.mark.long) for e in JUMPS if e != "turn_step")]
+)
 def test_a_jump_lasts_into_later_surveys(effect: str, tmp_path: Path) -> None:
     """The same sensors' last minutes as a survey of their own, whose start lies after the jump."""
     jump = {"type": effect, "rms_nT": 3.0, "sensors": ["S2"]} | JUMPS[effect]

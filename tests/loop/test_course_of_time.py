@@ -72,6 +72,7 @@ def test_a_thermometer_that_settles_is_not_accused_of_a_drift(law: str, seed: in
     assert adopted_names(told) or law.startswith("there")  # of which the catalogue has no drift
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "seed", [31, pytest.param(32, marks=pytest.mark.long), pytest.param(33, marks=pytest.mark.long)]
 )

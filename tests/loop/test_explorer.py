@@ -190,6 +190,7 @@ def partly(x):
 '''
 
 
+@pytest.mark.long
 def test_what_the_calibration_has_already_is_refused(tmp_path: Path, explorer: Explorer) -> None:
     file = tmp_path / "constant.py"
     file.write_text(CONSTANT)
@@ -316,6 +317,7 @@ def test_a_session_that_is_piped_in(
     assert json.loads((tmp_path / "by_run" / "verdict.json").read_text()) == verdict
 
 
+@pytest.mark.long
 def test_a_session_with_another_survey_is_another_session(
     tmp_path: Path, survey: Path, recipe: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -395,6 +397,7 @@ def test_what_cannot_be_explored(tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert "no stage close_loop" in capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_a_session_holds_its_verification_survey(
     tmp_path: Path, survey: Path, recipe: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -100,6 +100,7 @@ def test_a_thermometer_may_be_behind_the_sensor(change: Callable[[Path], None], 
     assert (words in found["unexplained"]["description"]) is delayed
 
 
+@pytest.mark.long
 def test_of_the_end_a_late_log_tells_nothing(tmp_path: Path) -> None:
     """What went on there is no part of the calibration, and is flagged; so it is on another survey."""
     effect = {"type": "temperature_offset", "channel": "temperature", "rms_nT": 3.0}
@@ -149,6 +150,7 @@ def test_a_delay_is_told_from_a_time_constant(name: str, channel: str, samples: 
     assert told["adopted"][0]["evidence"]["held_out_rms_after_nT"] < 1.1 * told["noise_floor_nT"]
 
 
+@pytest.mark.long
 def test_a_time_constant_is_told_from_a_delay(tmp_path: Path) -> None:
     effect = {"type": "current_field", "channel": "current_heater", "rms_nT": 3.0, "lag_s": 3.0}
     told = verdict_of(tmp_path, scenario(34, effect), models=["current_field", "channel_response"])

@@ -153,6 +153,7 @@ def test_a_source_that_nobody_logged_is_found_and_taken_off_another_survey(tmp_p
         assert after < 0.5 * before
 
 
+@pytest.mark.long
 def test_a_source_faster_than_the_samples_is_taken_off_another_survey(tmp_path: Path) -> None:
     """A hum whose frequency wanders: neighbouring samples differ by the source, and not by noise."""
     hum = {"type": "smooth", "rms": 1.0, "time_s": 0.6}

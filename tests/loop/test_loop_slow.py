@@ -215,6 +215,7 @@ def test_a_tone_is_taken_off_with_the_phase_and_strength_it_has_here(
     assert np.std(raw - record.raw) < 0.01
 
 
+@pytest.mark.long
 def test_a_lag_longer_than_the_survey_gives_way_to_a_drift(tmp_path: Path) -> None:
     """A thermometer through a lag of twenty minutes is as good a drift on this survey, and not on the next one."""
     drifting = scenario(8, {"type": "offset_drift", "rms_nT": 0.45})

@@ -18,6 +18,7 @@ from magtensor.result import open_result
 from magtensor.survey.model import without_variables
 
 
+@pytest.mark.long
 def test_errors_of_the_coefficients_go_with_the_calibration(tmp_path: Path) -> None:
     """Far from the mean of the calibration's current, its coefficients' errors are part of the tensor's."""
     effects = (

@@ -32,6 +32,7 @@ def gradient(rms_nT: float) -> dict[str, Any]:
     return {"type": "site_gradient", "rms_nT": rms_nT}
 
 
+@pytest.mark.long
 def test_a_gradient_without_attitude_is_no_nonlinearity(tmp_path: Path) -> None:
     told = verdict_of(tmp_path, scenario(21, gradient(0.6), motion=SHORT), models=MODELS)
     assert adopted_names(told) == set()

@@ -75,6 +75,7 @@ def test_the_time_of_the_mean_is_found_and_taken_off_another_survey(
             assert error < 0.2
 
 
+@pytest.mark.long
 def test_what_is_late_beside_it_makes_the_array_no_later(tmp_path: Path) -> None:
     """A filter of each axis would be both at once: late by what nobody measured, for its law to shorten as much."""
     spread = 0.05**2 / 24.0

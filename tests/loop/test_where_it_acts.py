@@ -59,6 +59,7 @@ def test_a_pump_that_ran_once_is_found() -> None:
     assert found.predicts_where_it_acts and found.passes
 
 
+@pytest.mark.long
 def test_another_disturbance_while_it_ran_is_not_the_pump() -> None:
     for seed in range(7, 15):
         rng = np.random.default_rng(seed)

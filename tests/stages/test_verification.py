@@ -170,6 +170,7 @@ def test_a_verification_survey_in_memory_is_asked_for(folder: Path) -> None:
     assert verified(folder, "again") == verified(folder, "out")
 
 
+@pytest.mark.long
 def test_an_error_of_the_base_station_that_has_ended_is_not_taken_off(tmp_path: Path) -> None:
     # its clock was late during the survey, and right when the second one was recorded
     active = SCENARIO["field"] | {"variation": {"irregular": {"rms_nT": 20.0, "time_s": 40.0}}}

@@ -20,6 +20,7 @@ def test_a_thermometer_seen_through_hours_is_no_cause_of_what_all_sensors_show_a
     assert row["kind"] in ("slow", "silent") and set(row["adopted"]) <= {"reference_drift"}
 
 
+@pytest.mark.long
 def test_a_sensor_that_wanders_drifts_at_most() -> None:
     row = wandering.tried(wandering.Trial("one sensor", "postures", 300.0, 0.2, 5000))
     assert row["kind"] != "event" and set(row["adopted"]) <= set(wandering.DRIFTS)
