@@ -39,7 +39,7 @@ def test_it_is_divided_into_parts_that_know_equally_much(at: float) -> None:
     blocks, plain = Blocks.of_an_event(terms), Blocks.equal(SAMPLES)
     first, after = blocks.divided
     starts, known = blocks.edges[blocks.folds], known_until(terms)
-    of_each = np.diff(known[starts])[blocks.parts]
+    of_each = np.diff(known[starts])[slice(*blocks.divided)]
     assert FOLDS // 2 < after - first <= FOLDS and of_each.min() > 0.02 and of_each.max() < 0.3
     assert np.diff(blocks.edges).min() >= LEAST_PER_BLOCK
     assert blocks.edges[0] == 0 and blocks.edges[-1] == SAMPLES and blocks.folds[-1] == len(blocks.edges) - 1
@@ -49,7 +49,7 @@ def test_it_is_divided_into_parts_that_know_equally_much(at: float) -> None:
 
 def test_what_few_samples_know_has_fewer_parts() -> None:
     blocks = Blocks.of_an_event(terms_of("offset_while", time_s=640.0, until_s=663.0))
-    lengths = np.diff(blocks.edges[blocks.folds])[blocks.parts]
+    lengths = np.diff(blocks.edges[blocks.folds])[slice(*blocks.divided)]
     assert 2 < len(lengths) < FOLDS and lengths.min() >= LEAST_PER_BLOCK
 
 

@@ -74,11 +74,6 @@ class Blocks:
         edges = np.concatenate([before, np.array(inner, dtype=int), after])
         return Blocks(edges, folds, (first, first + len(parts) - 1))
 
-    @property
-    def parts(self) -> slice:
-        """The folds that are parts of something that is over soon."""
-        return slice(*self.divided)
-
     def among(self, samples: int) -> Blocks:
         """The same of a survey with more or fewer samples."""
         if samples == self.edges[-1]:
