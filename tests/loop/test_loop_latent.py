@@ -14,9 +14,10 @@ from magtensor.error_models.switching import two_levels
 from magtensor.error_models.waveform import course_of, free_directions
 from magtensor.loop.correcting.correction import corrected_raw, hidden_waveform
 from magtensor.loop.evidence.factor import noise_alone, with_factor
+from magtensor.loop.evidence.shared_waveform import ALPHA, strongest
 from magtensor.loop.fitting.model import Adopted, Fitting, Record
 from magtensor.loop.fitting.refit import joint_state
-from magtensor.loop.searching.latent import ALPHA, _strongest, shared_words, sought, tried_source
+from magtensor.loop.searching.latent import shared_words, sought, tried_source
 from magtensor.registry import Registry
 from magtensor.tensor.geometry import array_design, standard_geometry
 
@@ -58,7 +59,7 @@ def test_noise_that_grows_quieter_in_all_sensors_is_no_common_factor() -> None:
         rng = np.random.default_rng(seed)
         basis = plane(rng, 4)
         loud = np.where(np.arange(3000) < 900, 3.0, 0.3)[:, None]
-        smallest.append(_strongest(own_noise(rng, 3000, 4) * loud @ basis, basis, by_sensor(4)).p)
+        smallest.append(strongest(own_noise(rng, 3000, 4) * loud @ basis, basis, by_sensor(4)).p)
     assert min(smallest) > 0.01 / len(smallest)
 
 
@@ -67,7 +68,7 @@ def test_a_source_that_comes_and_goes_tells_as_much_as_before() -> None:
     basis = plane(rng, 4)
     wave = np.repeat(rng.random(50) < 0.3, 60).astype(float) * (np.arange(3000) < 1500)
     z = (own_noise(rng, 3000, 4) + 0.4 * np.outer(wave, rng.standard_normal(12))) @ basis
-    assert _strongest(z, basis, by_sensor(4)).p < 1e-12
+    assert strongest(z, basis, by_sensor(4)).p < 1e-12
 
 
 def test_a_factor_is_told_from_noise_and_its_direction_found() -> None:

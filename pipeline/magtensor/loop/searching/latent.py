@@ -14,7 +14,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from magtensor.calibration.types import Array
 from magtensor.components import Component
@@ -23,20 +22,26 @@ from magtensor.error_models.terms import joined
 from magtensor.error_models.waveform import NAME, Course, course_of, free_directions
 from magtensor.loop.evidence.assessment import Assessment, estimated
 from magtensor.loop.evidence.colour import beside_the_field
-from magtensor.loop.evidence.factor import Factors, Groups, noise_alone, refitted, with_factor
+from magtensor.loop.evidence.factor import Groups, noise_alone, with_factor
 from magtensor.loop.evidence.folds import FOLDS, Blocks
 from magtensor.loop.evidence.gains import Gain
 from magtensor.loop.evidence.residual import Residual
+from magtensor.loop.evidence.shared_waveform import (
+    ALPHA,
+    LEAST_BAND,
+    by_output,
+    lowest,
+    predicted,
+    second_factor,
+    strongest,
+)
 from magtensor.loop.fitting.log_noise import brought_in
 from magtensor.loop.fitting.model import Adopted, Fitting, Record, State
 from magtensor.loop.fitting.refit import joint_state
 from magtensor.loop.searching.gates import OF_THE_LAW, Candidate, explained_before, explained_by, gained_of_a_log
 from magtensor.loop.searching.likeness import effect_along, followed, of_an_unseen_path
 
-ALPHA = 0.001  # family-wise over the bands
 LEAST_SENSORS = 3  # from here on noise of single sensors does not imitate a factor
-LEAST_BAND = 6  # coefficients of the lowest band for each value across
-_PARTS = 6  # of a band and of the survey, in which the noise of different values may have different power
 QUIET = 5.0  # times the median square of a step: of a few dozen values none is as large by chance
 LEVEL_ROUNDS = 3
 LEAST_NOISE = 0.1  # of what the fit believes
@@ -104,9 +109,9 @@ def sought(state: State, record: Record, *, may_follow: bool = False) -> Sought 
         return None
     sensors = len(residual.noise) // 3
     told = sensors >= LEAST_SENSORS
-    groups: Groups = [np.arange(3 * s, 3 * s + 3) for s in range(sensors)] if told else _outputs(basis)
+    groups: Groups = [np.arange(3 * s, 3 * s + 3) for s in range(sensors)] if told else by_output(basis)
     z, colour = beside_the_field(residual.across @ basis, residual.affine)
-    test = _strongest(colour.whiten(z), basis, groups)
+    test = strongest(colour.whiten(z), basis, groups)
     factors = with_factor(test.covariance, basis, groups, test.alone)
     course = _told_from_the_field(residual, held, factors.direction)
     if course.rms == 0:
@@ -115,7 +120,7 @@ def sought(state: State, record: Record, *, may_follow: bool = False) -> Sought 
     time = record.time[residual.samples]
     values = course.values / course.rms
     inside = lowest(z, test.band)
-    gain = _predicted(inside, z - inside, basis, groups)
+    gain = predicted(inside, z - inside, basis, groups)
     like = followed(time, values, record)
     objection = left_by = ""
     if not told:
@@ -133,7 +138,7 @@ def sought(state: State, record: Record, *, may_follow: bool = False) -> Sought 
         objection = f"the sensors feel it as they feel {left_by}, which may leave it"
     elif _acts_once(values):
         objection = SINGLE_STRETCH
-    elif _second(test, basis, factors) > SECOND:
+    elif second_factor(test, basis, factors) > SECOND:
         objection = "one waveform does not explain what the sensors share"
     return Sought(
         time=time,
@@ -211,7 +216,7 @@ def _own_noise(state: State) -> Array:
     steps = np.diff(put_back[0] @ basis, axis=0) / np.sqrt(2.0)
     size = np.sum(steps**2, axis=1)
     quiet = steps[size < QUIET * np.median(size)]  # where it does not switch
-    covariance, groups = quiet.T @ quiet / len(quiet), _outputs(basis)
+    covariance, groups = quiet.T @ quiet / len(quiet), by_output(basis)
     found = noise_alone(covariance, basis, groups)
     if found.log_p(len(quiet)) < np.log(ALPHA):
         found = with_factor(covariance, basis, groups, found)
@@ -288,125 +293,6 @@ def _put_back(state: State) -> tuple[Array, Array] | None:
     size = len(residual.noise)
     added = state.adopted[which].terms(state.excitation).at(residual.samples).contribution(theta, size)
     return residual.across + added / residual.noise @ residual.projector, theta / residual.noise
-
-
-@dataclass(frozen=True)
-class _Test:
-    """The band that speaks most clearly against noise of the groups alone."""
-
-    band: int
-    covariance: Array
-    alone: Factors
-    p: float
-
-
-def _strongest(white: Array, basis: Array, groups: Groups) -> _Test:
-    """The test in the lowest 1/2^k of the cosine coefficients of (N, m), for all k that leave enough of them."""
-    from scipy.fft import dct
-
-    n, m = white.shape
-    coefficients = dct(white, axis=0, norm="ortho")
-    count = int(np.log2((n - 1) / (LEAST_BAND * m)))
-    bands = sorted({LEAST_BAND * m * 2**k for k in range(count + 1)} | {n - 1})
-    tests = []
-    for band in bands:
-        own = coefficients[1 : band + 1]
-        covariance = own.T @ own / band
-        alone = noise_alone(covariance, basis, groups)
-        effective = _effective(own, lowest(white, band), covariance)
-        p = min(1.0, float(np.exp(alone.log_p(effective))) * len(bands))
-        tests.append(_Test(band, covariance, alone, p))
-    return max(tests, key=lambda t: t.band * t.alone.deviance)
-
-
-def _effective(coefficients: Array, course: Array, covariance: Array) -> float:
-    """How many coefficients of one colour and of one strength all the time tell as much.
-
-    Parameters
-    ----------
-    coefficients: (K, m) of a band; course: (N, m) the same over time.
-    """
-    return len(coefficients) / (_unevenness(coefficients, covariance) * _unevenness(course, covariance))
-
-
-def _unevenness(values: Array, covariance: Array) -> float:
-    """By what factor fewer values (K, m) tell as much, where their powers rise and fall together from part to part.
-
-    The covariance of two independent series of powers p and q varies as the mean of p q does.
-    """
-    values = values / np.sqrt(max(float(np.mean(values**2)), 1e-300) * len(covariance) / np.trace(covariance))
-    powers, vectors = np.linalg.eigh(covariance)
-    unit = values @ (vectors / np.sqrt(np.maximum(powers, 1e-12 * powers[-1])))
-    power = np.stack([np.mean(part**2, axis=0) for part in np.array_split(unit, _PARTS)])
-    products = power.T @ power / _PARTS
-    m = len(covariance)
-    alike = (products.sum() - np.trace(products)) / (m * (m - 1))
-    return max(float(alike), 1.0)
-
-
-def lowest(series: Array, band: int) -> Array:
-    """(N, K) without its mean and all cosine coefficients above the lowest ones."""
-    from scipy.fft import dct, idct
-
-    coefficients = dct(series, axis=0, norm="ortho")
-    coefficients[0] = 0.0
-    coefficients[band + 1 :] = 0.0
-    out: Array = idct(coefficients, axis=0, norm="ortho")
-    return out
-
-
-def _outputs(basis: Array) -> Groups:
-    return [np.array([i]) for i in range(len(basis))]
-
-
-def _second(test: _Test, basis: Array, factors: Factors) -> float:
-    """Strength of a second factor beside the first; zero where noise may make it."""
-    alone = test.alone
-    if factors.freedom == 0:  # three sensors: only noise of each output alone leaves anything to disagree
-        alone = noise_alone(test.covariance, basis, _outputs(basis))
-        factors = with_factor(test.covariance, basis, _outputs(basis), alone)
-    if factors.log_p(test.band) > np.log(ALPHA):
-        return 0.0
-    first = alone.deviance - factors.deviance - (alone.freedom - factors.freedom) / test.band
-    second = factors.deviance - factors.freedom / test.band
-    return second / max(first, 1e-300)
-
-
-def _predicted(inside: Array, outside: Array, basis: Array, groups: Groups) -> Gain:
-    """Squares of each sensor's whitened residual as the others predict it, in stretches that the model has not seen.
-
-    Before: the noise of the sensors, with all that it lets them know of each other. After: with the factor. What is
-    outside the band is in both.
-    """
-    n = len(inside)
-    edges = np.linspace(0, n, FOLDS + 1).round().astype(int)
-    sums = np.stack([inside[a:b].T @ inside[a:b] for a, b in itertools.pairwise(edges)])
-    split = [_own_and_others(basis, group) for group in groups]
-    total = sums.sum(axis=0)
-    noise = noise_alone(total / n, basis, groups)
-    whole = with_factor(total / n, basis, groups, noise)
-    before, after = np.zeros(FOLDS), np.zeros(FOLDS)
-    for k, (a, b) in enumerate(itertools.pairwise(edges)):
-        train = (total - sums[k]) / (n - (b - a))
-        alone, factors = (refitted(train, basis, groups, near) for near in (noise, whole))
-        for own, others in split:
-            rest = float(np.sum((outside[a:b] @ own) ** 2))
-            before[k] += rest + _error(alone.covariance, sums[k], own, others)
-            after[k] += rest + _error(factors.covariance, sums[k], own, others)
-    return Gain(before, after, np.diff(edges) * float(sum(own.shape[1] for own, _ in split)))
-
-
-def _own_and_others(basis: Array, group: NDArray[np.int_]) -> tuple[Array, Array]:
-    """Directions (m, k) that a group of outputs moves, and those (m, m - k) that it does not."""
-    u, s, _ = np.linalg.svd(basis[group].T, full_matrices=True)
-    return u[:, : len(s)], u[:, len(s) :]
-
-
-def _error(model: Array, sums: Array, own: Array, others: Array) -> float:
-    """Sum of squares of `own` less what a model's covariance predicts of it from `others`."""
-    through = np.linalg.solve(others.T @ model @ others, others.T @ model @ own)
-    left = own - others @ through
-    return float(np.sum(left * (sums @ left)))
 
 
 def _turning(record: Record, state: State) -> bool:
