@@ -9,6 +9,7 @@ from magtensor.components import Component
 from magtensor.error_models.example import example_survey
 from magtensor.error_models.settings import (
     AnyChannel,
+    AsAWhole,
     Beginning,
     Choice,
     Delays,
@@ -121,6 +122,10 @@ def _in_words(mark: object) -> str:
     if isinstance(mark, Range):
         share = " of the survey's duration" if mark.of_duration else ""
         return f"{mark.low:g} to {mark.high:g}{share} in {mark.count} {mark.spacing} steps, the best refined"
+    if isinstance(mark, AsAWhole):
+        return (
+            "False; True with the delays that what is left has most in common with, and once it is adopted, if better"
+        )
     if isinstance(mark, Forms):
         others = " or ".join(repr(o) for o in mark.options[1:])
         return f"{mark.options[0]!r}; {others} once it is adopted, if that is better"

@@ -34,7 +34,6 @@ import argparse
 import os
 import sys
 from collections.abc import Iterator
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -49,11 +48,9 @@ from loop_surveys import BASE, EFFECTS, FAMILIES, MOTIONS, recorded, scenario
 from magtensor.components import Component
 from magtensor.errors import MagtensorError
 from magtensor.loop.evidence.assessment import Colours, colours_of, estimated, explained
-from magtensor.loop.evidence.colour import Colour
-from magtensor.loop.evidence.residual import Residual
-from magtensor.loop.evidence.turned import TurnedColour
 from magtensor.loop.fitting.model import Fitting, Record, State
 from magtensor.loop.fitting.refit import joint_state
+from magtensor.loop.searching.delayed_logs import Delays
 from magtensor.loop.searching.found import Search
 from magtensor.loop.searching.gates import ALPHA
 from magtensor.loop.searching.outcome import why
@@ -123,20 +120,6 @@ def colours_without(trial: Trial) -> Colours:
     return colours_of(joint_state(recorded(simulated(trial)), [], Fitting()).residual)
 
 
-def resized(colour: Colour | TurnedColour, residual: Residual) -> Any:
-    """A colour at the samples of another residual."""
-    count = len(residual.affine)
-    if isinstance(colour, TurnedColour):
-        modes = residual.slow_modes
-        return replace(
-            colour, modes=modes, variance=colour.variance[: 3 * modes.most], rest=resized(colour.rest, residual)
-        )
-    if colour.power is None or len(colour.power) == count:
-        return colour
-    own = np.arange(len(colour.power)) / len(colour.power)
-    return replace(colour, power=np.interp(np.arange(count) / count, own, colour.power))
-
-
 def oracle(trial: Trial, simulation: Simulated, record: Record, state: State) -> float | None:
     """The p value of the effect alone with its right settings; None where these cannot be known."""
     from scipy.stats import chi2
@@ -150,7 +133,7 @@ def oracle(trial: Trial, simulation: Simulated, record: Record, state: State) ->
         settings["lag_s"] = float(np.ravel(next(iter(simulation.truth.effects[0].coefficients.values())))[0])
     terms = models()[trial.effect].function(state.excitation, **settings).at(state.residual.samples)
     known = colours_without(trial._replace(effect="", amplitude=0.0))
-    colours = Colours(resized(known.across, state.residual), resized(known.along, state.residual))
+    colours = known.among(state.residual)
     estimate = estimated(state.residual, terms, colours)
     return float(chi2.sf(explained(estimate), estimate.rank)) if estimate.rank else 1.0
 
@@ -159,8 +142,9 @@ def tests(trial: Trial, state: State) -> float:
     """How many tests the loop corrects the p value of the effect for: those of its settings, times the models tried."""
     every = testable(state.excitation, list(models().values()))
     few = Thinned.of(state, SCREENING_SAMPLES)
-    found = best_settings(models()[trial.effect], state, few, {}, ALPHA / len(every))
-    return len(every) * (found[0][1] if found else 1.0)
+    delays = Delays(state.residual, state.excitation)
+    found = best_settings(models()[trial.effect], state, few, delays, {}, ALPHA / len(every))
+    return len(every) * (found[0].tried if found else 1.0)
 
 
 def lost(found: Search, effect: str) -> str:

@@ -62,8 +62,8 @@ def channel_response(
     power: Annotated[int, Choice((1, 2, 3)), Field(ge=1, le=3, description="power of the channel")] = 1,
     lag_s: Annotated[
         float,
-        Range(0.0, 300.0, count=5, spacing="log"),
-        Field(ge=0, description="how far the response is behind the channel, s"),
+        Range(0.0, 300.0, count=5, spacing="log", late=True),
+        Field(description="how far the response is behind the channel, s; below 0 the channel's log is so much late"),
     ] = 0.0,
     smooth: Smooth = False,
     delayed: Delayed = False,

@@ -4,11 +4,11 @@ from typing import Annotated
 
 from pydantic import Field
 
-from magtensor.error_models.settings import Beginning, Cleaned, Forms
+from magtensor.error_models.settings import AsAWhole, Beginning, Cleaned, Forms
 
 Delayed = Annotated[
     bool,
-    Forms((False, True)),
+    AsAWhole(),
     Field(description="true: later than the channel by lag_s, unchanged; false: behind it with a time constant lag_s"),
 ]
 

@@ -29,7 +29,7 @@ def current_field(
     channel: Annotated[str, CURRENT, Field(description="current channel; '': the only one")] = "",
     lag_s: Annotated[
         float,
-        Range(-2.0, 10.0, count=6, spacing="log", late=True),
+        Range(0.0, 10.0, count=5, spacing="log", late=True),
         Field(description="how far the current is behind the logged one, s; below 0 the log is so much late"),
     ] = 0.0,
     smooth: Smooth = False,

@@ -30,7 +30,8 @@ class Range:
             other side, beyond `count`, up to a fifth of the survey: a log that is late tells nothing of the end).
         of_duration: the limits are fractions of the survey's duration.
         sampled: nothing shorter than the time between samples is tried, which no sample would show.
-        late: below 0 the log of what is followed comes so much too late as a whole, in whatever form it is followed.
+        late: below 0 the log of what is followed comes so much too late as a whole, in whatever form it is followed;
+            such delays are no part of the grid, but found from the residual.
     """
 
     low: float
@@ -188,6 +189,19 @@ class Forms(Choice):
 class Cleaned(Forms):
     """A channel as it was logged, or without the noise of its log: forms alike only where that noise is small beside
     the channel's course. So the second one is tried as soon as a model is looked at closely."""
+
+
+@dataclass(frozen=True)
+class AsAWhole(Forms):
+    """Whether what follows a channel is behind it with a time constant, or later as a whole, or earlier. Delays are
+    found from what the channel has in common with the residual, and searched with where they are the likelier.
+
+    Attributes:
+        lag: the setting that is the lag, s.
+    """
+
+    options: tuple[bool, bool] = (False, True)
+    lag: str = "lag_s"
 
 
 @dataclass(frozen=True)

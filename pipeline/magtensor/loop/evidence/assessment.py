@@ -33,6 +33,14 @@ class Colours:
     across: Colour
     along: Colour | TurnedColour
 
+    def among(self, residual: Residual) -> Colours:
+        """The same at the samples of a residual, which may be more or fewer."""
+        samples, along = len(residual.affine), self.along
+        if isinstance(along, Colour):
+            return Colours(self.across.among(samples), along.among(samples))
+        same = len(along.modes.response) == samples
+        return Colours(self.across.among(samples), along if same else along.among(residual.slow_modes))
+
 
 WHITE = Colours(Colour(None, 1.0), Colour(None, 1.0))
 

@@ -9,7 +9,7 @@ which keeps trends from leaking round the ends.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -42,6 +42,13 @@ class Colour:
     def lowest(self) -> float:
         """Power at the lowest frequency over the white level."""
         return 1.0 if self.power is None else float(self.power[0])
+
+    def among(self, samples: int) -> Colour:
+        """The same for a series with more or fewer samples."""
+        if self.power is None or len(self.power) == samples:
+            return self
+        own = np.arange(len(self.power)) / len(self.power)
+        return replace(self, power=np.interp(np.arange(samples) / samples, own, self.power))
 
     def log_volume(self, count: int) -> float:
         """The sum of the logarithms of the spectrum, for a series of so many samples."""

@@ -116,6 +116,11 @@ class TurnedColour:
     def __post_init__(self) -> None:
         object.__setattr__(self, "modes", self.modes.slowest(len(self.variance) // 3))
 
+    def among(self, modes: SlowModes) -> TurnedColour:
+        """The same where slow noise shows as these modes say, of a series with more or fewer samples."""
+        modes = modes.slowest(len(self.variance) // 3)
+        return TurnedColour(modes, self.variance[: 3 * modes.most], self.rest.among(len(modes.response)))
+
     @property
     def white(self) -> float:
         """The white level."""

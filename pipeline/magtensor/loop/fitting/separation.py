@@ -26,6 +26,7 @@ def fold_gain(state: State, colours: Colours, *terms: Terms, parts: Blocks | Non
     blocked = np.arange(together.count) < sum(t.count for t in given)
     samples = len(state.residual.affine)
     parts = Blocks.equal(samples) if parts is None else parts.among(samples)
+    colours = colours.among(state.residual)
     blocks = grams(state.residual, together, colours.across, colours.along, parts.edges)
     return held_out_gain(blocks, state.residual.freedom, blocked, parts)
 

@@ -20,6 +20,7 @@ from magtensor.loop.fitting.log_noise import brought_in, channels_of
 from magtensor.loop.fitting.model import Adopted, State, generic
 from magtensor.loop.fitting.separation import Assessed, lowest, plainer
 from magtensor.loop.searching.contribution import happens_once
+from magtensor.loop.searching.delayed_logs import Delays
 from magtensor.loop.searching.gates import Candidate
 from magtensor.loop.searching.kin import explained_beside, explained_by_kin
 from magtensor.loop.searching.profiling import (
@@ -27,9 +28,9 @@ from magtensor.loop.searching.profiling import (
     SCREENING_SAMPLES,
     Thinned,
     best_settings,
-    refined,
     terms_of,
 )
+from magtensor.loop.searching.refining import refined
 from magtensor.loop.searching.several_logs import of_another_log
 from magtensor.sharing import shared_out
 
@@ -45,7 +46,7 @@ def candidates_of(state: State, models: Sequence[Component], failed: dict[str, s
     if len(state.residual.affine) > REFINING_SAMPLES:
         scored = _scored_on_all(state, scored, failed)
     looked_at = _shortlist(scored, lambda s: s.white, len(names)) + _shortlist(scored, lambda s: s.coloured, len(names))
-    looked_at += [s for s in scored if s.short and s.promises(len(names))]
+    looked_at += [s for s in scored if s.kind and s.promises(len(names))]
     assessed = _looked_at(state, looked_at, failed)
     found = _one_each(state, assessed)
     adjusted = _holm([a.p * tried for _, tried, _, a in found], len(names))
@@ -65,14 +66,15 @@ def candidates_of(state: State, models: Sequence[Component], failed: dict[str, s
 def _ranked(state: State, models: Sequence[Component], failed: dict[str, str], alpha: float) -> list[_Screened]:
     """Every model with its best settings and what it explains, of a long survey on a part of the samples."""
     few, more = Thinned.of(state, SCREENING_SAMPLES), Thinned.of(state, REFINING_SAMPLES)
+    delays = Delays(state.residual, state.excitation)
 
-    def ranked(model: Component) -> tuple[list[tuple[dict[str, Any], float, float, float, bool]], dict[str, str]]:
+    def ranked(model: Component) -> tuple[list[tuple[dict[str, Any], float, float, float, str]], dict[str, str]]:
         rows, fails = [], dict[str, str]()
-        for settings, tried, short in best_settings(model, state, few, fails, alpha / max(len(models), 1)):
-            terms = more.terms(model, settings, fails)
+        for each in best_settings(model, state, few, delays, fails, alpha / max(len(models), 1)):
+            terms = more.terms(model, each.settings, fails)
             if terms is not None and terms.count:
-                white, coloured = (score(terms) - log(tried) for score in (more.white, more.coloured))
-                rows.append((settings, tried, white, coloured, short))
+                white, coloured = (score(terms) - log(each.tried) for score in (more.white, more.coloured))
+                rows.append((each.settings, each.tried, white, coloured, each.kind))
         return rows, fails
 
     scored = []
@@ -142,26 +144,26 @@ def _holm(values: Sequence[float], models: int) -> list[float]:
 @dataclass(frozen=True)
 class _Screened:
     """A model with settings, and how unlikely it is that chance explains as much in white noise and in noise of the
-    residual's colour: -log of the p value, corrected for the settings that were tried; `short` if these are of a short
-    part of the survey, which white noise says nothing of."""
+    residual's colour: -log of the p value, corrected for the settings that were tried; their kind, as in `Proposed`. Of
+    a short part of the survey white noise says nothing."""
 
     model: Component
     settings: dict[str, Any]
     tried: float
     white: float
     coloured: float
-    short: bool = False
+    kind: str = ""
 
     def promises(self, models: int) -> bool:
         """Whether it may be significant among so many models when it is looked at closely."""
-        least = self.coloured if self.short else max(self.white, self.coloured)
+        least = self.coloured if self.kind == "short" else max(self.white, self.coloured)
         return bool(np.exp(-least) * models < HOPELESS)
 
 
 def _shortlist(scored: Sequence[_Screened], score: Callable[[_Screened], float], models: int) -> list[_Screened]:
     """The models that chance explains least, each with the settings that do; of the hopeless ones hardly any."""
     best: dict[str, _Screened] = {}
-    for each in (each for each in scored if not each.short):
+    for each in (each for each in scored if not each.kind):
         if each.model.name not in best or score(each) > score(best[each.model.name]):
             best[each.model.name] = each
     first = sorted(best.values(), key=score, reverse=True)[: SCREENED // 2]
