@@ -47,6 +47,7 @@ LEVEL_ROUNDS = 3
 LEAST_NOISE = 0.1  # of what the fit believes
 SINGLE_STRETCH = "it acts in a single short stretch, which no other can confirm"
 ONCE = 0.9  # of a waveform's power in a stretch as long as one that is held out
+OF_A_CHANNEL = "its waveform follows channel"
 SECOND = 0.1  # a second factor this strong beside the first: not one waveform
 
 
@@ -133,7 +134,7 @@ def sought(state: State, record: Record, *, may_follow: bool = False) -> Sought 
     elif not gain.consistent:
         objection = "the sensors do not predict each other with it on held-out stretches"
     elif like is not None and not may_follow:
-        objection = f"its waveform follows channel {like[0]}"
+        objection = f"{OF_A_CHANNEL} {like[0]}"
     elif left_by := effect_along(state, basis, seen):
         objection = f"the sensors feel it as they feel {left_by}, which may leave it"
     elif _acts_once(values):
@@ -331,8 +332,8 @@ def shared_words(found: Sought, sensors: Sequence[str]) -> str:
     if found.like is not None:
         name, lag, power, correlation = found.like
         to_the = "" if power == 1 else f" to the power {power}"
-        return words + (
-            f" and is most like channel {name}{to_the} with a lag of {lag:.3g} s (correlation {correlation:+.2f})"
-        )
-    words += " and follows no logged channel"
-    return words + (f"; not adopted: {found.objection}" if found.objection else "")
+        words += f" and is most like channel {name}{to_the} with a lag of {lag:.3g} s (correlation {correlation:+.2f})"
+    else:
+        words += " and follows no logged channel"
+    said = found.like is not None and found.objection.startswith(OF_A_CHANNEL)
+    return words + (f"; not adopted: {found.objection}" if found.objection and not said else "")

@@ -17,18 +17,21 @@ REMEMBERS = 0.3  # of its size, what other samples change of a regressor that re
 
 
 def followed(time: Array, values: Array, record: Record) -> tuple[str, float, int, float] | None:
-    """The channel, lag, power and correlation that come nearest to a waveform, if they come near."""
+    """The channel, lag, power and correlation that come nearest to a waveform, if they come near; of delays of its log
+    either way the shortest that does."""
     points = np.linspace(time[0], time[-1], min(COMPARED, len(time)))
     step = points[1] - points[0]
     wave = _means(time, values, points)
+    most = max(1, int(MOST_LAG * len(points)))
     best: tuple[str, float, int, float] | None = None
     for name, channel in record.logged.items():
         for column in channel.reshape(len(channel), -1).T:
             sampled = _means(record.time, column, points)
             for power in (1, 2, 3):
                 series = sampled**power
-                for shift in range(max(1, int(MOST_LAG * len(points))) + 1):
-                    a, b = wave[shift:], series[: len(series) - shift]
+                for shift in sorted(range(-most, most + 1), key=abs):
+                    later, sooner = max(shift, 0), max(-shift, 0)
+                    a, b = wave[later : len(wave) - sooner], series[sooner : len(series) - later]
                     if not a.std() > 0 or not b.std() > 0:
                         continue
                     c = float(np.corrcoef(a, b)[0, 1])
