@@ -70,7 +70,8 @@ def test_of_two_logs_of_one_cause_the_noisier_is_named_as_a_rival(tmp_path: Path
     assert "current_field" in suspects(told)
 
 
-@pytest.mark.parametrize(("log_noise", "rms_nT"), [(0.005, 3.0), pytest.param(0.015, 0.5, marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize(("log_noise", "rms_nT"), [(0.005, 3.0), (0.015, 0.5)])
 def test_a_noisy_log_takes_no_name_away(log_noise: float, rms_nT: float, tmp_path: Path) -> None:
     """Through a lag a log has less noise, so that a response to any channel, which may lag, seemed to do better."""
     survey = scenario(81, {"type": "supply_offset", "channel": "supply", "rms_nT": rms_nT})

@@ -16,7 +16,8 @@ MODELS = ["temperature_offset", "nonlinearity_quadratic", "offset_drift", "laten
 
 
 @pytest.mark.parametrize(
-    "effect", [None, "nonlinearity_quadratic", pytest.param("temperature_offset", marks=pytest.mark.long)]
+    "effect",
+    [None, *(pytest.param(n, marks=pytest.mark.long) for n in ("nonlinearity_quadratic", "temperature_offset"))],
 )
 def test_what_is_there_is_found_and_nothing_is_made_of_rounding(effect: str | None, tmp_path: Path) -> None:
     effects: list[dict[str, Any]] = [] if effect is None else [{"type": effect, "rms_nT": 5.0}]

@@ -56,10 +56,10 @@ NOISES = {
     "one axis": ({2: 3.0}, 60.0, 1, 2),
     "one axis that walks": ({2: 5.0}, 3000.0, 1, 2),
 }
-SHORT = ("one sensor, smooth",)
 
 
-@pytest.mark.parametrize("which", [n if n in SHORT else pytest.param(n, marks=pytest.mark.long) for n in NOISES])
+@pytest.mark.long
+@pytest.mark.parametrize("which", NOISES)
 def test_the_p_value_is_one(which: str) -> None:
     """Offsets for a while at places that nobody sought: of 80 the p values are as even as chance has them."""
     offset_while = Registry.load().find("error_model", "offset_while")

@@ -140,7 +140,7 @@ def delayed(
     """The settings of a grid with the channel later as a whole by the delays that suit it best, none of models that
     know no such form; and how many independent tests all delays amount to."""
     marks = profiled(model)
-    forms = [(name, mark.lag) for name, mark in marks.items() if isinstance(mark, AsAWhole)]
+    forms = [(name, mark.lag) for name, mark in marks.items() if isinstance(mark, AsAWhole) and mark.lag in marks]
     channels = [name for name, mark in marks.items() if isinstance(mark, AnyChannel)]
     found, tests = [], 0.0
     for form, lag in forms if len(channels) == 1 else []:
