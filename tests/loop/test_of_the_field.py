@@ -4,11 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
 import pytest
-from loop_cases import BASE, scenario, suspects, verdict_of
+from loop_cases import BASE, loaded, scenario, suspects, verdict_of
+
+from magtensor.loop.fitting.model import Adopted, Fitting
+from magtensor.loop.fitting.refit import joint_state
+from magtensor.loop.searching.adopting import polished
+from magtensor.registry import Registry
 
 OFFSETS_NT = 3000.0
 PPM = np.random.default_rng(51).uniform(20.0, 100.0, (4, 3)) * np.array([1.0, -1.0, 1.0])  # a degree, each axis
@@ -53,3 +59,29 @@ def test_a_cubic_term_of_the_field(tmp_path: Path) -> None:
     told = verdict_of(tmp_path, scenario(52, instrument=instrument), change, models)
     assert [a["error_model"] for a in told["adopted"]] == ["nonlinearity_cubic"], suspects(told)
     assert told["adopted"][0]["settings"]["of_field"]
+
+
+def test_the_form_is_asked_again_when_what_is_beside_it_has_moved(tmp_path: Path) -> None:
+    """Iron with too short a time constant leaves so much that its wrong form seems to suit the scale factor."""
+    effects: list[dict[str, Any]] = [
+        {"type": "temperature_scale", "rms_nT": 10.0, "lag_s": 12.0},  # simulated of the field
+        {"type": "viscous_magnetisation", "rms_nT": 10.0, "tau_s": 5.0},
+    ]
+    survey = scenario(51, *effects, rate_Hz=4.0, motion=BASE["motion"] | {"duration_s": 450.0})
+    survey["instrument"]["errors"]["bias_nT"] = 1500.0
+    record = loaded(tmp_path, survey)
+    settings = {
+        "temperature_scale": {"channel": "temperature", "lag_s": 10.0, "of_field": False},
+        "viscous_magnetisation": {"tau_s": 3.0},
+    }
+    registry, models = Registry.load(), []
+    for name, given in settings.items():
+        component = registry.find("error_model", name)
+        plain = {n: p.default for n, p in component.parameters.items()}
+        models.append(Adopted(component, plain | given, tuple(record.sensors)))
+    how = Fitting()
+    state = polished(record, joint_state(record, models, how), how)
+    scale, iron = state.adopted
+    assert scale.settings["of_field"]
+    assert scale.settings["lag_s"] == pytest.approx(12.0, abs=1.5)
+    assert iron.settings["tau_s"] == pytest.approx(5.0, rel=0.02)

@@ -151,8 +151,15 @@ def _sensors_showing(state: State, which: int) -> tuple[str, ...] | None:
 
 def polished(record: Record, state: State, how: Fitting) -> State:
     """The forms of the models, what they began with and their settings on a range, sought once more now that everything
-    is fitted together; a setting that is a little off leaves a residual that another model would be adopted for."""
-    state = _as_they_began(record, _in_their_forms(record, state, how), how)
+    is fitted together; a setting that is a little off leaves a residual that another model would be adopted for. Beside
+    one that has moved another form may be right."""
+    state = _at_rest(record, _as_they_began(record, _in_their_forms(record, state, how), how), how)
+    formed = _in_their_forms(record, state, how)
+    return state if formed is state else _at_rest(record, formed, how)
+
+
+def _at_rest(record: Record, state: State, how: Fitting) -> State:
+    """The models with the settings on a range that suit each other."""
     for _ in range(_SWEEPS):
         moved = False
         for number, model in enumerate(state.adopted):
