@@ -10,6 +10,7 @@ from loop_cases import Array, linear_state, synthetic
 from scipy.stats import kstest
 
 from magtensor.calibration.types import ArrayCalibration
+from magtensor.error_models.direction import attitude_series, curve_series
 from magtensor.error_models.switching import two_levels
 from magtensor.error_models.waveform import course_of, free_directions
 from magtensor.loop.correcting.correction import corrected_raw, hidden_waveform
@@ -17,6 +18,7 @@ from magtensor.loop.evidence.factor import noise_alone, with_factor
 from magtensor.loop.evidence.shared_waveform import ALPHA, strongest
 from magtensor.loop.fitting.model import Adopted, Fitting, Record
 from magtensor.loop.fitting.refit import joint_state
+from magtensor.loop.searching import latent
 from magtensor.loop.searching.latent import shared_words, sought, tried_source
 from magtensor.registry import Registry
 from magtensor.tensor.geometry import array_design, standard_geometry
@@ -273,6 +275,29 @@ def test_what_follows_the_attitude_is_no_source(rank: int) -> None:
         if rank == 1
         else "one waveform does not explain what the sensors share"
     )
+
+
+def test_a_kink_of_the_field_is_no_source(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Amplifiers with a gain of their own beyond a reading, alike in x of all sensors: a curve of the field along x, of
+    which laws of low degree leave most."""
+    monkeypatch.setattr(latent, "attitude_series", lambda x: np.zeros((len(x.time), 1)))
+    size = np.array([1.0, -0.8, 1.2, 0.6])
+    clean = synthetic(2, 2 * N)
+    x = linear_state(clean).excitation
+    u = x.field[:, 0] / 50_000.0
+    kink = np.abs(u[:, 0] - 0.2)
+    curved = clean.raw.copy()
+    curved[:, :, 0] += 40.0 * kink[:, None] * size
+    assert objection(replace(clean, raw=curved)) == "its waveform follows the direction of the field"
+    assert not objection(with_source())
+
+    half = len(u) // 2
+    left = []
+    for series in (attitude_series(x), curve_series(x)):
+        known = np.column_stack([np.ones(len(u)), u, series])
+        theta = np.linalg.lstsq(known[:half], kink[:half], rcond=1e-9)[0]
+        left.append(np.std(kink[half:] - known[half:] @ theta))
+    assert left[1] < 0.2 * left[0]
 
 
 @pytest.mark.parametrize("alike", [True, False])

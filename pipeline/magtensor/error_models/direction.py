@@ -11,6 +11,7 @@ from magtensor.calibration.types import Array
 from magtensor.error_models.excitation import VECTORS, Excitation
 
 LINE = 20.0  # power over the median of what is beside it: one in ten thousand by chance, in the largest of a hundred
+KNOTS = 17  # of a curve: an eighth of the field apart, which offsets of an array's sensors do not blur
 WIDTH = 4  # frequencies, a survey's length apart, beyond which the window shows nothing of a line
 BESIDE = np.array([s * k for k in range(WIDTH, 31, 3) for s in (-1, 1)])  # such frequencies, the nearest first
 
@@ -41,6 +42,14 @@ def attitude_series(x: Excitation) -> Array:
     for v in vectors:
         columns += [v, np.einsum("ni,nj->nij", u, v).reshape(len(v), -1)]
     return np.column_stack(columns)
+
+
+def curve_series(x: Excitation) -> Array:
+    """(N, K): any curve of each component of the field's direction, straight between knots: what kinks or has steps is
+    no polynomial of low degree."""
+    u = _unit(x.field[:, 0])
+    at = (u + 1.0) * (KNOTS - 1) / 2.0
+    return np.concatenate([np.maximum(1.0 - np.abs(at - knot), 0.0) for knot in range(KNOTS)], axis=1)
 
 
 def turning_Hz(x: Excitation) -> float:

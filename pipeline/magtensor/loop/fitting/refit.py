@@ -19,7 +19,7 @@ from magtensor.error_models.delays import cleared
 from magtensor.error_models.excitation import Excitation
 from magtensor.error_models.terms import Terms, joined
 from magtensor.errors import NotEnoughData
-from magtensor.loop.evidence.assessment import Colours, colours_of, estimated, log_likelihood
+from magtensor.loop.evidence.assessment import WHITE, Colours, colours_of, estimated, log_likelihood
 from magtensor.loop.evidence.residual import Residual, quick, residual_of, taken_off
 from magtensor.loop.evidence.statistics import Estimate
 from magtensor.loop.evidence.stretches import borne_out, louder, too_loud
@@ -83,11 +83,10 @@ def joint_state(
         before = np.concatenate(theta)
         # what no data show stays zero, whatever earlier rounds made of it
         shown = estimate.seen(before)
-        after = shown + share_of(residual, terms, estimate.theta, colours) * estimate.theta
+        after = shown + move_of(residual, terms, estimate, colours, fresh=not before.any())
         theta = np.split(after, edges)
         raw, reference = without(record, each, theta)
-        step = np.abs(after - before) / np.sqrt(np.maximum(np.diag(estimate.covariance), 1e-300))
-        if np.max(step, initial=0.0) < SETTLED:
+        if small(after - before, estimate):
             fit = _fit(record, adopted, raw, reference, how, keep, start=fit)
             x = beside_the_site(excitation_of(record, fit, raw, lines, seen), adopted, theta)
             break
@@ -142,18 +141,35 @@ def without_noise(theta: Array, estimate: Estimate) -> Array:
     return theta
 
 
-def share_of(residual: Residual, terms: Terms, step: Array, colours: Colours) -> float:
-    """The part of a step that makes the residual, in noise of its own colour then, likelier; 0 if none does.
+def move_of(residual: Residual, terms: Terms, estimate: Estimate, colours: Colours, *, fresh: bool) -> Array:
+    """(P,) by how much coefficients are moved, so that the residual gets likelier in noise of its own colour then.
 
-    The step is the best one in noise of the colour that the residual has now, and the colour changes with it: a slow
-    effect not quite taken off looks like slow noise, in which it is then taken off even less.
+    The estimate is the best one in noise of the colour that the residual has now, and the colour changes with it: a
+    slow effect not quite taken off looks like slow noise, in which it is then taken off even less. A `fresh` one, of
+    which nothing is taken off yet, may be that noise altogether: so it is sought in white noise as well, and so is a
+    step where none leads further.
     """
+    best, reached = _likelier(residual, terms, estimate.theta, colours)
+    if fresh or not (best.any() or small(estimate.theta, estimate)):
+        other, likelihood = _likelier(residual, terms, estimated(residual, terms, WHITE).theta, colours)
+        best = other if likelihood > reached else best
+    return best
+
+
+def _likelier(residual: Residual, terms: Terms, step: Array, colours: Colours) -> tuple[Array, float]:
+    """The part of a step (P,) that makes the residual likelier, and how likely it is then; none of it if none does."""
     now = log_likelihood(residual, colours)
     for share in _SHARES:
         left = taken_off(residual, terms, share * step)
-        if log_likelihood(left, colours_of(left)) >= now - _LIKELIHOOD_ROUNDING:
-            return share
-    return 0.0
+        if (likelihood := log_likelihood(left, colours_of(left))) >= now - _LIKELIHOOD_ROUNDING:
+            return share * step, likelihood
+    return np.zeros_like(step), now
+
+
+def small(step: Array, estimate: Estimate) -> bool:
+    """Whether a step (P,) is one that the data hardly see."""
+    deviations = np.sqrt(np.maximum(np.diag(estimate.covariance), 1e-300))
+    return bool(np.max(np.abs(step) / deviations, initial=0.0) < SETTLED)
 
 
 def _fit(

@@ -32,7 +32,7 @@ from magtensor.loop.evidence.statistics import Estimate
 from magtensor.loop.evidence.stretches import borne_out_in
 from magtensor.loop.evidence.turned import SlowModes, TurnedColour
 from magtensor.loop.fitting.model import Adopted, Record
-from magtensor.loop.fitting.refit import MOST_ROUNDS, SETTLED, share_of
+from magtensor.loop.fitting.refit import MOST_ROUNDS, move_of, small
 from magtensor.loop.fitting.seen import beside_the_site
 
 LEAST_LEFT = 8  # values along the field beyond the parameters: of fewer the noise is not known
@@ -94,11 +94,11 @@ def surveys_state(of: Together) -> SurveysState:
         colours = colours_of(residual, stiff=True)
         estimate = estimated(residual, terms, _beside_what_is_free(colours, residual, terms.count))
         before = theta if len(theta) else np.zeros(terms.count)
-        share = share_of(residual, terms, estimate.theta, colours)
-        theta = estimate.seen(before) + share * estimate.theta  # what no data show stays zero
+        move = move_of(residual, terms, estimate, colours, fresh=not before.any())
+        theta = estimate.seen(before) + move  # what no data show stays zero
         parts = np.split(theta, np.cumsum([e.count for e in each])[:-1])
         samples = _without(of, each, parts)
-        if np.max(np.abs(theta - before) / np.sqrt(np.maximum(np.diag(estimate.covariance), 1e-300))) < SETTLED:
+        if small(theta - before, estimate):
             if not more:
                 break
             lasting = False

@@ -17,7 +17,7 @@ import numpy as np
 
 from magtensor.calibration.types import Array
 from magtensor.components import Component
-from magtensor.error_models.direction import attitude_series
+from magtensor.error_models.direction import attitude_series, curve_series
 from magtensor.error_models.terms import joined
 from magtensor.error_models.waveform import NAME, Course, course_of, free_directions
 from magtensor.loop.evidence.assessment import Assessment, estimated
@@ -297,7 +297,8 @@ def _put_back(state: State) -> tuple[Array, Array] | None:
 
 
 def _turning(record: Record, state: State) -> bool:
-    """Whether the attitude predicts an adopted source in stretches that its coefficients have not seen.
+    """Whether the attitude predicts an adopted source in stretches that its coefficients have not seen, by a law of low
+    degree or by any curve of the field along each axis, which is what a sensor that is not linear makes of it.
 
     Beyond the field itself, whose part C has taken. Asked when the source is known, for until then it is in the field
     too, and what differs between that and a logged attitude follows the source.
@@ -305,19 +306,26 @@ def _turning(record: Record, state: State) -> bool:
     found = _put_back(state)
     assert found is not None
     across, direction = found
-    series = across @ direction
-    columns = np.column_stack([state.residual.affine, attitude_series(state.excitation)[state.residual.samples]])
+    series, affine = across @ direction, state.residual.affine
     n = len(series)
-    if n < 4 * columns.shape[1]:
-        return False
+    laws = [made(state.excitation)[state.residual.samples] for made in (attitude_series, curve_series)]
     edges = np.linspace(0, n, FOLDS + 1).round().astype(int)
-    loss = np.zeros((2, FOLDS))
-    for k, (a, b) in enumerate(itertools.pairwise(edges)):
-        train = np.r_[0:a, b:n]
-        for i, some in enumerate((columns[:, :4], columns)):
-            theta = np.linalg.lstsq(some[train], series[train], rcond=1e-9)[0]
-            loss[i, k] = np.sum((series[a:b] - some[a:b] @ theta) ** 2)
-    return Gain(loss[0], loss[1], np.diff(edges).astype(float)).consistent
+    before = _held_out_losses(series, affine, edges)
+    return any(
+        Gain(before, _held_out_losses(series, columns, edges), np.diff(edges).astype(float)).consistent
+        for columns in (np.column_stack([affine, *laws[:k]]) for k in (1, 2))
+        if n >= 4 * columns.shape[1]
+    )
+
+
+def _held_out_losses(series: Array, columns: Array, edges: Array) -> Array:
+    """(F,) squares of a series (n,) in folds that columns (n, K) predict from the others."""
+    losses = []
+    for a, b in itertools.pairwise(edges):
+        train = np.r_[0:a, b : len(series)]
+        theta = np.linalg.lstsq(columns[train], series[train], rcond=1e-9)[0]
+        losses.append(np.sum((series[a:b] - columns[a:b] @ theta) ** 2))
+    return np.array(losses)
 
 
 def shared_words(found: Sought, sensors: Sequence[str]) -> str:
