@@ -16,7 +16,7 @@ from magtensor.loop.evidence.gains import Gain
 from magtensor.loop.evidence.grams import Whitened
 from magtensor.loop.fitting.model import Adopted, Fitting
 from magtensor.loop.fitting.refit import joint_state
-from magtensor.loop.searching.gates import ALPHA, SECOND_ORDER, Candidate, adds_to_axes, explained_before, seen_between
+from magtensor.loop.searching.gates import ALPHA, SECOND_ORDER, Candidate, explained_before, seen_between
 from magtensor.loop.searching.outcome import why
 from magtensor.loop.searching.rounds import with_lines
 from magtensor.loop.searching.screening import candidates_of
@@ -98,7 +98,7 @@ def test_a_drift_that_lies_in_a_few_folds_passes_by_the_spectra_of_the_sensors(
         one, model=Adopted(registry.find("error_model", name), {"tau_s": 300.0}), terms=drift, tried=1.0,
         adjusted_p=0.01, adjusted_own_p=own_p, adjusted_null_p=0.1, assessment=assessed,
     )  # fmt: skip
-    assert not changed.assessment.gain.consistent and adds_to_axes(drift)
+    assert not changed.assessment.gain.consistent and drift.adds_to_axes
     assert changed.passes is passes
 
 

@@ -16,7 +16,7 @@ from loop_cases import Array, adopted_names, linear_state, scenario, synthetic, 
 from magtensor.loop.fitting.errors_before_after import folds_for
 from magtensor.loop.fitting.model import Adopted, Fitting, Record, State
 from magtensor.loop.fitting.refit import joint_state
-from magtensor.loop.searching.gates import OF_THE_LAW, Candidate, adds_to_axes
+from magtensor.loop.searching.gates import OF_THE_LAW, Candidate
 from magtensor.loop.searching.kin import drivers, explained_by_kin
 from magtensor.registry import Registry
 
@@ -89,8 +89,8 @@ def test_what_is_added_to_the_axes_and_what_turns_with_the_field() -> None:
         model("nonlinearity_quadratic"),
         model("hysteresis", half_width_nT=2000.0),
     ]
-    assert all(adds_to_axes(m.terms(x)) for m in added)
-    assert not any(adds_to_axes(m.terms(x)) for m in turned)
+    assert all(m.terms(x).adds_to_axes for m in added)
+    assert not any(m.terms(x).adds_to_axes for m in turned)
 
 
 def telegraph(seed: int, time: Array, dwell_s: float) -> Array:

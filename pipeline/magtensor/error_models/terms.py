@@ -86,6 +86,16 @@ class Terms:
         own, its = _places(self), _places(other)
         return self.series.shape == other.series.shape and all(map(np.array_equal, own, its))
 
+    @property
+    def adds_to_axes(self) -> bool:
+        """Whether every series is added to all axes of a sensor alike, or to the reference: what turns with the field
+        is another one in each axis."""
+        if not np.all(self.part_weight == 1.0):
+            return False
+        raw = self.part_output != REFERENCE
+        touched = {*zip(self.part_series[raw].tolist(), self.part_output[raw].tolist(), strict=True)}
+        return all((s, 3 * (o // 3) + axis) in touched for s, o in touched for axis in range(3))
+
     def only(self, keep: Iterable[int]) -> Terms:
         """The terms of these numbers, in this order."""
         order = list(keep)

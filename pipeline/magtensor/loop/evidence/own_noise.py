@@ -21,7 +21,8 @@ from magtensor.calibration.types import Array
 from magtensor.error_models.terms import REFERENCE, Terms, joined
 from magtensor.loop.evidence.columns import across_directions, along_the_field
 from magtensor.loop.evidence.one_series import one_series_p
-from magtensor.loop.evidence.residual import Residual
+from magtensor.loop.evidence.other_times import as_at_other_times
+from magtensor.loop.evidence.residual import Residual, taken_off
 from magtensor.loop.evidence.sensor_noise import (
     LEAST,
     SensorNoise,
@@ -41,6 +42,7 @@ from magtensor.loop.evidence.statistics import (
 )
 
 MOST_MISSING = 0.25  # of the samples: longer gaps are shortened to that
+NOT_ASKED = 0.05  # p value, from which on nobody asks how likely it is
 LEAST_RESOLVED = 8  # frequencies, of the shortest surveys
 _INNER_RANK = 1e-6  # of the largest singular value
 _LEAST_SEEN = 1e-9  # of what is known of the best axis of a sensor, of the others
@@ -81,9 +83,33 @@ class OwnNoise:
         known from (Satterthwaite 1946): beta-distributed, like the squared multiple correlation. Where bands of
         few and of many values come together that share has no bound of one, and would be far too unlikely; chi-square,
         as if the levels were known, errs to the other side in one band. The larger of both is taken.
+
+        The slow noise of a single sensor is seen through its turning alone, and has no spectrum along the field: what
+        it explains there is compared with what it does at other times (`other_times`).
         """
         from scipy.special import betaincc, chdtrc
 
+        explained, rank, freedom = self.explained(terms)
+        if freedom <= rank + 1.0:
+            return 1.0
+        share_of_all = min(explained / freedom, 1.0)
+        found = max(float(betaincc(rank / 2.0, (freedom - rank) / 2.0, share_of_all)), float(chdtrc(rank, explained)))
+        alone = len(self.residual.noise) == 3 and self.residual.sighted is None
+        if not alone or not terms.adds_to_axes or found > NOT_ASKED:
+            return found
+        return max(found, as_at_other_times(explained / rank, rank, self._beside(terms).explained, terms))
+
+    def _beside(self, terms: Terms) -> OwnNoise:
+        """The noise of what terms leave, seen along the field, they being free as well."""
+        assert self.residual.along is not None
+        together = terms if self.given is None else joined([self.given, terms])
+        columns, free = along_the_field(self.residual, [together]).made, self.residual.free_along
+        theta = np.linalg.lstsq(columns - free @ (free.T @ columns), self.residual.along, rcond=_INNER_RANK)[0]
+        return OwnNoise(taken_off(self.residual, together, np.asarray(theta, dtype=float)), together)
+
+    def explained(self, terms: Terms) -> tuple[float, int, float]:
+        """What terms explain beside the given ones, in how many directions, and from how many values its scale is
+        known; 0 in none where they show in none."""
         every = terms if self.given is None else joined([self.given, terms])
         across, along = self._across_of(every), self._along_of(every)
         size = every.count if across is None else across.into.shape[1]
@@ -103,17 +129,12 @@ class OwnNoise:
         seen = identifiable(seen @ normal @ seen.T, Own(alone[tested], terms.noise_of_each)).T @ seen
         rank = len(seen)
         if not rank:
-            return 1.0
+            return 0.0, 0, 0.0
         parts, counts = self._noise_of(across, along, seen, every.count)
         inverse = np.linalg.pinv(parts.sum(axis=0), hermitian=True)
         share = np.einsum("ij,bji->b", inverse, parts)
-        freedom = rank**2 / float(np.sum(share**2 / counts))
-        if freedom <= rank + 1.0:
-            return 1.0
         found = seen @ score
-        explained = float(found @ inverse @ found)
-        share_of_all = min(explained / freedom, 1.0)
-        return max(float(betaincc(rank / 2.0, (freedom - rank) / 2.0, share_of_all)), float(chdtrc(rank, explained)))
+        return float(found @ inverse @ found), rank, rank**2 / float(np.sum(share**2 / counts))
 
     def _free(self, normal: Array, alone: Array, given: int, terms: int) -> Array:
         """(P, q) directions of coefficients (P,) that are free: of the given ones those that the data show, and all of
@@ -426,5 +447,4 @@ def _in_octaves(column: Array, values: Array, taken: Array) -> float:
 def _course(spectrum: Array) -> Array:
     from scipy.fft import idct
 
-    out: Array = idct(spectrum, axis=0, norm="ortho")
-    return out
+    return np.asarray(idct(spectrum, axis=0, norm="ortho"))

@@ -9,7 +9,7 @@ import numpy as np
 
 from magtensor.calibration.types import Array
 from magtensor.error_models.settings import AnyChannel, profiled
-from magtensor.error_models.terms import REFERENCE, Terms, joined
+from magtensor.error_models.terms import Terms, joined
 from magtensor.loop.evidence.assessment import BORNE_OUT, Assessment
 from magtensor.loop.evidence.residual import Residual, taken_off
 from magtensor.loop.fitting.model import Adopted, State
@@ -103,7 +103,7 @@ class Candidate:
             return True
         if not self._of_a_known_spectrum:
             return False
-        by_blocks = self.assessment.p * self.tried if adds_to_axes(self.terms) else self.adjusted_p
+        by_blocks = self.assessment.p * self.tried if self.terms.adds_to_axes else self.adjusted_p
         return self.adjusted_own_p < self.alpha and by_blocks < BORNE_OUT
 
     @property
@@ -115,7 +115,7 @@ class Candidate:
     @property
     def beyond_own_noise(self) -> bool:
         """Whether it is added to the axes and noise of each sensor's own spectrum does not explain it."""
-        return self._of_a_known_spectrum and adds_to_axes(self.terms) and self.adjusted_own_p < self.alpha
+        return self._of_a_known_spectrum and self.terms.adds_to_axes and self.adjusted_own_p < self.alpha
 
     @property
     def beyond_slow_noise(self) -> bool:
@@ -164,16 +164,6 @@ class Candidate:
     def passes(self) -> bool:
         """Both gates."""
         return self.predicts and self.beyond_slow_noise
-
-
-def adds_to_axes(terms: Terms) -> bool:
-    """Whether every series of regressors is added to all axes of a sensor alike, or to the reference: what turns with
-    the field is another one in each axis."""
-    if not np.all(terms.part_weight == 1.0):
-        return False
-    raw = terms.part_output != REFERENCE
-    touched = {(s, o) for s, o in zip(terms.part_series[raw].tolist(), terms.part_output[raw].tolist(), strict=True)}
-    return all((s, 3 * (o // 3) + axis) in touched for s, o in touched for axis in range(3))
 
 
 def gained_of_a_log(log_noise: float, coefficients: float) -> float:
