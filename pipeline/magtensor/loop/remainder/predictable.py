@@ -6,12 +6,13 @@ import numpy as np
 
 from magtensor.calibration.types import Array
 from magtensor.error_models.acting import AXES
-from magtensor.error_models.direction import attitude_series, direction_series
+from magtensor.error_models.direction import attitude_series, curve_series, direction_series
 from magtensor.error_models.excitation import Excitation
 from magtensor.error_models.terms import Terms, joined
 from magtensor.loop.evidence.assessment import WHITE, Colours
 from magtensor.loop.evidence.folds import FOLDS, block_count
 from magtensor.loop.evidence.gains import Gain, held_out_gain
+from magtensor.loop.evidence.residual import Residual
 from magtensor.loop.fitting.model import State
 
 LEAST_T = 4.5  # one in a thousand by chance: paired t over folds of what the direction predicts
@@ -19,6 +20,8 @@ LEAST_T_OF_EACH = 6.5  # the same for each of a dozen outputs
 LEAST_IN_CLASS = 20  # samples that read much the same
 LEAST_CLASSES, MOST_CLASSES = 16, 64
 MOSTLY = 0.9  # of what outputs of their own explain: if the total field alone does that, it is the total field
+MOST_OF_IT = 0.5  # of what an effect adds: so much of it, predicted from the attitude, follows the attitude
+ROUNDING = 1e-6  # of the largest singular value
 LEAST_FOR_DIRECTION = 60  # samples for each output, at least, before its own polynomial can be asked for
 
 
@@ -64,6 +67,31 @@ def predictable_in_the_total_field(state: State) -> float:
 def enough_for_the_total_field(state: State) -> bool:
     """Whether there are samples enough to ask what of the total field the attitude predicts."""
     return len(state.residual.affine) >= LEAST_FOR_DIRECTION * attitude_series(state.excitation).shape[1]
+
+
+def attitude_part(state: State, added: Array) -> float:
+    """How much of the variance of series (N, 3 S) nT that are added to the outputs at the residual's samples can be
+    predicted from the attitude, whatever the law."""
+    residual = state.residual
+    series = attitude_series(state.excitation)[residual.samples]
+    own = residual.free_across
+    added, series = (x - own @ (own.T @ x) for x in (added / residual.noise, series))
+    follows = np.linalg.lstsq(series, added, rcond=None)[0]
+    total = float(np.sum(added**2))
+    return 1.0 - float(np.sum((added - series @ follows) ** 2)) / total if total > 0 else 0.0
+
+
+def attitude_square(state: State, left: Residual) -> float:
+    """Sum of squares of what a residual across, at the state's samples, shows of laws of the attitude and of any curve
+    of the field along each axis, beyond what as many columns follow of anything."""
+    assert left.across is not None
+    x, residual = state.excitation, state.residual
+    series = np.hstack([made(x)[residual.samples] for made in (attitude_series, curve_series)])
+    own = residual.free_across
+    basis, size, _ = np.linalg.svd(series - own @ (own.T @ series), full_matrices=False)
+    basis = basis[:, size > ROUNDING * size[0]]
+    found, every = float(np.sum((basis.T @ left.across) ** 2)), float(np.sum(left.across**2))
+    return max(found - every * basis.shape[1] / len(left.across), 0.0)
 
 
 def converter_words(state: State) -> list[str]:

@@ -17,7 +17,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from magtensor.calibration.types import Array
-from magtensor.error_models.direction import attitude_series, turning_Hz
+from magtensor.error_models.direction import turning_Hz
 from magtensor.error_models.settings import Frequencies, profiled
 from magtensor.error_models.terms import joined
 from magtensor.error_models.waveform import NAME
@@ -25,12 +25,16 @@ from magtensor.loop.evidence.assessment import estimated
 from magtensor.loop.evidence.residual import taken_off
 from magtensor.loop.fitting.log_noise import channels_of
 from magtensor.loop.fitting.model import Adopted, State
-from magtensor.loop.remainder.predictable import enough_for_the_total_field, predictable_in_the_total_field
+from magtensor.loop.remainder.predictable import (
+    MOST_OF_IT,
+    attitude_part,
+    enough_for_the_total_field,
+    predictable_in_the_total_field,
+)
 from magtensor.loop.searching.contribution import happens_once, slices
 from magtensor.loop.searching.found import Search, without_and_with
 from magtensor.loop.searching.unexplained import unexplained, unlikely
 
-MOSTLY = 0.5  # of what an effect adds: so much of it, predicted from the attitude, follows the attitude
 NAMELESS = 2.0  # times what stays, that a response to a logged vector explains if it is the law
 ALONG = 0.95  # cosine, with a source's vector or another event's; of one sensor 5 % of all directions are as near
 HARMONICS = 16  # of the turning, that a law of the attitude with a corner shows
@@ -86,7 +90,7 @@ def _of_the_attitude(state: State, places: Sequence[int]) -> str:
     frequency = _frequency(state.adopted[places[0]])
     if frequency and frequency < HARMONICS * (turning := turning_Hz(state.excitation)):
         return f"may be a harmonic of the platform's turning ({turning:.3g} Hz)"
-    follows = _follows_a_vector(state, places) or attitude_share(state, places) > MOSTLY
+    follows = _follows_a_vector(state, places) or attitude_share(state, places) > MOST_OF_IT
     return "follows the attitude" if follows else ""
 
 
@@ -189,7 +193,7 @@ def staying(found: Search) -> float:
         theta = estimated(residual, together, state.colours).theta
         explained = residual.square() - taken_off(residual, together, theta).square()
         own = terms.contribution(theta[together.count - terms.count :], len(residual.noise))
-        if explained > other and attitude_part(state, own) <= MOSTLY:
+        if explained > other and attitude_part(state, own) <= MOST_OF_IT:
             other = explained
     return float(np.sqrt(max(residual.square() - 1.0 - other, 0.0)) * residual.scale)
 
@@ -212,14 +216,3 @@ def attitude_share(state: State, places: Sequence[int]) -> float:
         part = slices(state)[place]
         theta[part] = state.theta[place]
     return attitude_part(state, state.terms.contribution(theta, len(state.residual.noise)))
-
-
-def attitude_part(state: State, added: Array) -> float:
-    """The same of series (N, 3 S) nT that are added to the outputs at the residual's samples."""
-    residual = state.residual
-    series = attitude_series(state.excitation)[residual.samples]
-    own = residual.free_across
-    added, series = (x - own @ (own.T @ x) for x in (added / residual.noise, series))
-    follows = np.linalg.lstsq(series, added, rcond=None)[0]
-    total = float(np.sum(added**2))
-    return 1.0 - float(np.sum((added - series @ follows) ** 2)) / total if total > 0 else 0.0

@@ -29,6 +29,7 @@ from magtensor.loop.searching.course_of_time import beside_time, rivals_in_time
 from magtensor.loop.searching.exchange import looked_at_again, simpler
 from magtensor.loop.searching.found import Step
 from magtensor.loop.searching.gates import Candidate
+from magtensor.loop.searching.larger_law import part_of_a_larger_law
 from magtensor.loop.searching.latent import NAME, Sought, Source, renewed, sought, tried_source
 from magtensor.loop.searching.own_fit import at_their_own_fit
 from magtensor.loop.searching.profiling import already, repeatable
@@ -239,6 +240,9 @@ def _first_kept(
         chosen, rivals = simplest(best, possible, before.state)
         if name := part_of_a_drift(chosen, candidates, before.state):
             refused[chosen.model.name] = f"{name}, which lasts, predicts as much"
+            continue
+        if why := part_of_a_larger_law(chosen, before.state):
+            refused[chosen.model.name] = why
             continue
         chosen, channels = nearest(chosen, before.state, models)
         for frequency in tones_of(chosen.model):

@@ -1,0 +1,45 @@
+"""Candidates that are a small part of a law of the attitude which has no name.
+
+Every law of the attitude resembles any other one a little: of a kink in the transfer curve of each axis a polynomial
+takes the most, a gradient of the site some of the rest, an error of the positions a little of that. What each of them
+leaves follows the attitude as well, and is larger than what it explains. In the end they would be taken out again, one
+after the other (`overshadowed`); until then every one makes all fits larger.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from magtensor.error_models.terms import joined
+from magtensor.loop.evidence.residual import taken_off
+from magtensor.loop.fitting.model import Adopted, State
+from magtensor.loop.remainder.predictable import attitude_square
+from magtensor.loop.searching.contribution import a_tone
+from magtensor.loop.searching.gates import Candidate
+from magtensor.loop.searching.kin import TIME, drivers
+
+SMALL = 1.0 / 9.0  # a third of the amplitude: what is found comes first, so nine more as large would have to be there
+
+
+def part_of_a_larger_law(candidate: Candidate, state: State) -> str:
+    """Why a candidate is not adopted that follows the attitude and leaves far more that does; "" where it does not."""
+    before, terms = candidate.before or state, candidate.terms
+    if before.residual.across is None or terms.delay is not None or not _of_the_attitude(candidate.model, state):
+        return ""
+    theta, residual = candidate.assessment.theta, before.residual
+    together = terms if before.terms is None else joined([before.terms, terms])
+    left = taken_off(residual, together, theta)
+    assert residual.across is not None and left.across is not None
+    explained = float(np.sum(residual.across**2) - np.sum(left.across**2))
+    stays = attitude_square(before, left)
+    if explained >= SMALL * stays:
+        return ""
+    ratio = np.sqrt(max(explained, 0.0) / stays)
+    return f"it follows the attitude, and so does what it leaves, of which it is {ratio:.0%}"
+
+
+def _of_the_attitude(model: Adopted, state: State) -> bool:
+    """Whether a model of the sensors or the site has no course of its own but for the attitude: no channel, no time."""
+    x = state.excitation
+    of_its_own = any(name == TIME or not x.is_vector(name) for name in drivers(model, x))
+    return not (of_its_own or a_tone(model) or model.component.effect == "reference")
