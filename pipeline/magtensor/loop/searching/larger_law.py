@@ -11,6 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from magtensor.error_models.terms import joined
+from magtensor.loop.evidence.assessment import estimated
 from magtensor.loop.evidence.residual import taken_off
 from magtensor.loop.fitting.model import Adopted, State
 from magtensor.loop.remainder.predictable import attitude_square
@@ -26,9 +27,8 @@ def part_of_a_larger_law(candidate: Candidate, state: State) -> str:
     before, terms = candidate.before or state, candidate.terms
     if before.residual.across is None or terms.delay is not None or not _of_the_attitude(candidate.model, state):
         return ""
-    theta, residual = candidate.assessment.theta, before.residual
-    together = terms if before.terms is None else joined([before.terms, terms])
-    left = taken_off(residual, together, theta)
+    residual, together = before.residual, terms if before.terms is None else joined([before.terms, terms])
+    left = taken_off(residual, together, estimated(residual, together, candidate.assessment.colours).theta)
     assert residual.across is not None and left.across is not None
     explained = float(np.sum(residual.across**2) - np.sum(left.across**2))
     stays = attitude_square(before, left)
