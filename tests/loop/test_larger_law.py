@@ -25,14 +25,14 @@ def directions() -> Array:
 
 
 def kinked(rms_nT: float) -> Array:
-    """(N, 4, 3) a gain of its own beyond a reading, in x of every sensor, without what three degrees follow of it."""
+    """(N, 4, 3) a gain of its own beyond a reading, in every axis, without what three degrees follow of it."""
     u = directions()
     powers = [p for p in np.ndindex(4, 4, 4) if sum(p) < 4]
     low = np.column_stack([np.prod(u ** np.array(p), axis=1) for p in powers])
-    kink = np.abs(u[:, 0] - 0.2)
-    kink -= low @ np.linalg.lstsq(low, kink, rcond=None)[0]
-    out = np.zeros((SAMPLES, 4, 3))
-    out[:, :, 0] = rms_nT * (kink / kink.std())[:, None] * np.array([1.0, -0.8, 1.2, 0.6])
+    kinks = np.abs(u - 0.2)
+    kinks -= low @ np.linalg.lstsq(low, kinks, rcond=None)[0]
+    size = np.random.default_rng(3).uniform(0.5, 1.5, (4, 3))
+    out: Array = rms_nT * (kinks / kinks.std(axis=0))[:, None] * size
     return out
 
 

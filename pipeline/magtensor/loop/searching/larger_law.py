@@ -10,13 +10,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from magtensor.error_models.terms import joined
+from magtensor.calibration.types import Array
+from magtensor.error_models.terms import Terms, joined
 from magtensor.loop.evidence.assessment import estimated
-from magtensor.loop.evidence.residual import taken_off
+from magtensor.loop.evidence.residual import Residual, taken_off
 from magtensor.loop.fitting.model import Adopted, State
 from magtensor.loop.remainder.predictable import attitude_square
 from magtensor.loop.searching.contribution import a_tone
-from magtensor.loop.searching.gates import Candidate
+from magtensor.loop.searching.gates import Candidate, seen_between
 from magtensor.loop.searching.kin import TIME, drivers
 
 SMALL = 1.0 / 9.0  # a third of the amplitude: what is found comes first, so nine more as large would have to be there
@@ -28,7 +29,10 @@ def part_of_a_larger_law(candidate: Candidate, state: State) -> str:
     if before.residual.across is None or terms.delay is not None or not _of_the_attitude(candidate.model, state):
         return ""
     residual, together = before.residual, terms if before.terms is None else joined([before.terms, terms])
-    left = taken_off(residual, together, estimated(residual, together, candidate.assessment.colours).theta)
+    estimate = estimated(residual, together, candidate.assessment.colours)
+    if not _differs_between_sensors(residual, terms, np.diag(estimate.normal)[-terms.count :]):
+        return ""
+    left = taken_off(residual, together, estimate.theta)
     assert residual.across is not None and left.across is not None
     explained = float(np.sum(residual.across**2) - np.sum(left.across**2))
     stays = attitude_square(before, left)
@@ -36,6 +40,13 @@ def part_of_a_larger_law(candidate: Candidate, state: State) -> str:
         return ""
     ratio = np.sqrt(max(explained, 0.0) / stays)
     return f"it follows the attitude, and so does what it leaves, of which it is {ratio:.0%}"
+
+
+def _differs_between_sensors(residual: Residual, terms: Terms, known: Array) -> bool:
+    """Whether most of what terms can do differs between the sensors: with coefficients of either sign that show as much
+    of their own, of which so much (P,) is known."""
+    signs = np.where(np.random.default_rng(0).random(len(known)) < 0.5, -1.0, 1.0)
+    return seen_between(residual, terms, np.where(known > 0, signs / np.sqrt(np.maximum(known, 1e-300)), 0.0))
 
 
 def _of_the_attitude(model: Adopted, state: State) -> bool:
