@@ -289,6 +289,7 @@ def test_many_rotations_near_the_limit_are_unbiased():
     assert np.mean(squares) < 1.6  # 54 squares of unit variance exceed this once in 200
 
 
+@pytest.mark.long
 def test_noise_of_unequal_components_is_weighed():
     rng = np.random.default_rng(13)
     g = dipole_components(40.0)
