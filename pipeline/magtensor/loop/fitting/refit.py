@@ -146,11 +146,11 @@ def move_of(residual: Residual, terms: Terms, estimate: Estimate, colours: Colou
 
     The estimate is the best one in noise of the colour that the residual has now, and the colour changes with it: a
     slow effect not quite taken off looks like slow noise, in which it is then taken off even less. A `fresh` one, of
-    which nothing is taken off yet, may be that noise altogether: so it is sought in white noise as well, and so is a
-    step where none leads further.
+    which nothing is taken off yet, may be that noise altogether: so it is sought in white noise as well. Not later:
+    where a drift of another law stays, that is no noise either, and a response to a thermometer would follow it.
     """
     best, reached = _likelier(residual, terms, estimate.theta, colours)
-    if fresh or not (best.any() or small(estimate.theta, estimate)):
+    if fresh:
         other, likelihood = _likelier(residual, terms, estimated(residual, terms, WHITE).theta, colours)
         best = other if likelihood > reached else best
     return best
