@@ -1,8 +1,8 @@
 """By how much as a whole what the sensors show is later than a logged channel, or earlier: to a sample.
 
 Of a channel that goes fast a delay of half its period leaves nothing to be seen, so that no grid of lags finds its way
-there. What the residual has in common with the channel at every delay is a cross-correlation, which costs two Fourier
-transforms. It proposes delays only: each is scored beside the other settings, as a test of its own.
+there. What the residual has in common with the channel at every delay is a cross-correlation, which costs a few
+Fourier transforms. It proposes delays only: each is scored beside the other settings, as a test of its own.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from magtensor.loop.evidence.multiplicity import effective_tests
 from magtensor.loop.evidence.residual import Residual
 
 LONGEST = 0.05  # of the survey: of what a log is late by, its end tells nothing
-_LEAST = 1e-6  # of the square of a course, which the fit's freedom leaves of it
 MOST_GAPS = 4.0  # times as long as the samples themselves: what is mostly gaps is not correlated
+_LEAST = 1e-6  # of the square of a course, which the fit's freedom leaves of it
 _POWER = "power"  # the setting that is the power of a channel
 
 
@@ -98,6 +98,18 @@ class Delays:
         ----------
         alpha: probability at which all tests together are to be judged.
         """
+        if (channel, power) not in self._found:  # several models follow one channel
+            self._found[channel, power] = self._best(channel, power)
+        best, near = self._found[channel, power]
+        return best, effective_tests([near] * (2 * self.reach), alpha)
+
+    @cached_property
+    def _found(self) -> dict[tuple[str, int], tuple[list[float], float]]:
+        return {}
+
+    def _best(self, channel: str, power: int) -> tuple[list[float], float]:
+        """The delays as in `of`, and how alike the channel is from one sample to the next; alike altogether where there
+        is no delay to be asked for."""
         logged = self.x.logged[channel]
         if self.reach < 1 or self.x.is_vector(channel):
             return [], 1.0
@@ -109,7 +121,7 @@ class Delays:
             return [], 1.0
         best = {int(np.argmax(one)) - self.reach for one in self.explained(course)} - {-self.reach, 0, self.reach}
         near = float(np.min(np.sum(course[:, 1:] * course[:, :-1], axis=1) / size))
-        return [self.step * d for d in sorted(best)], effective_tests([near] * (2 * self.reach), alpha)
+        return [self.step * d for d in sorted(best)], near
 
     def explained(self, courses: Array) -> list[Array]:
         """(2 reach + 1,) of the residual's square, in white noise, in each way by courses (C, count), the same for all
