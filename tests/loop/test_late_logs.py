@@ -85,9 +85,8 @@ def make_temperature_late(path: Path) -> None:
             file.create_dataset(each, data=kept).attrs.update(attributes)
 
 
-@pytest.mark.parametrize(
-    ("change", "delayed"), [pytest.param(make_slow, False, marks=pytest.mark.long), (make_temperature_late, True)]
-)
+@pytest.mark.long
+@pytest.mark.parametrize(("change", "delayed"), [(make_slow, False), (make_temperature_late, True)])
 def test_a_thermometer_may_be_behind_the_sensor(change: Callable[[Path], None], delayed: bool, tmp_path: Path) -> None:
     effect = {"type": "temperature_offset", "channel": "temperature", "rms_nT": 3.0}
     found = verdict_of(tmp_path, scenario(35, effect), change, lasting_effects())
