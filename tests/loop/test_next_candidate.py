@@ -16,6 +16,7 @@ from magtensor.loop.fitting.model import Adopted, Fitting, Record, State
 from magtensor.loop.searching import by_hand, outcome, rivals, rounds
 from magtensor.loop.searching.course_of_time import BesideTime
 from magtensor.loop.searching.gates import ALPHA, Candidate
+from magtensor.loop.searching.keeping import ONE_OF_A_KIND, Fitted
 from magtensor.registry import Registry
 
 EFFECTS = ({"type": "temperature_offset", "rms_nT": 1.0}, {"type": "nonlinearity_cubic", "rms_nT": 0.6})
@@ -99,7 +100,7 @@ def test_a_small_part_of_what_failed_is_no_candidate() -> None:
 def test_of_every_model_it_is_told_why_it_was_not_adopted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The first candidate is refused and all others are said to be parts of it, so that nothing is adopted; most
     explain too little to be looked at closely."""
-    monkeypatch.setattr(rounds, "_kept", lambda *_: (None, "refused"))
+    monkeypatch.setattr(rounds, "fitted", lambda *_: Fitted(None, "refused"))
     monkeypatch.setattr(rounds, "part_of", lambda *_: True)
     survey = scenario(33, *EFFECTS, motion=BASE["motion"] | {"duration_s": 600.0})
     told = verdict_of(tmp_path, survey, models=lasting_effects())
@@ -117,23 +118,23 @@ def test_of_every_model_it_is_told_why_it_was_not_adopted(tmp_path: Path, monkey
     assert screened and not screened & {c["error_model"] for step in told["steps"] for c in step["looked_at"]}
 
 
-@pytest.mark.parametrize("why", [rounds.ONE_OF_A_KIND, "fitted, it raises the held-out error of S1"])
+@pytest.mark.parametrize("why", [ONE_OF_A_KIND, "fitted, it raises the held-out error of S1"])
 def test_what_another_width_of_an_adopted_law_explains_is_no_other_effect(
     why: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Two widths that a joint fit moves together are one law, which leaves something; what fails otherwise does not
     stand for anything."""
     width, creep, other = (candidate(n, g) for n, g in (("hysteresis", 9.0), ("bandwidth", 6.0), ("eddy_current", 5.0)))
-    fitted: list[str] = []
+    tried: list[str] = []
 
-    def kept(record: Any, before: Any, chosen: Any, how: Any) -> tuple[None, str]:
-        fitted.append(chosen.model.name)
-        return None, why if chosen is width else "it leaves more than it takes away"
+    def fitted(record: Any, before: Any, chosen: Any, how: Any) -> Fitted:
+        tried.append(chosen.model.name)
+        return Fitted(None, why if chosen is width else "it leaves more than it takes away")
 
     def unchanged(chosen: Any, *_: Any) -> tuple[Any, tuple[str, ...]]:
         return chosen, ()
 
-    monkeypatch.setattr(rounds, "_kept", kept)
+    monkeypatch.setattr(rounds, "fitted", fitted)
     monkeypatch.setattr(rounds, "containing", lambda best, *_: best)
     monkeypatch.setattr(rounds, "simplest", unchanged)
     monkeypatch.setattr(rounds, "nearest", unchanged)
@@ -145,10 +146,11 @@ def test_what_another_width_of_an_adopted_law_explains_is_no_other_effect(
     for each in (width, creep, other):
         each.predicts = True
     given: Any = SimpleNamespace(state=None)
-    found = rounds._first_kept(given, given, [width, creep, other], given, 0, 30, None)
+    search = rounds.Rounds([], 0, 8, 0.005, None, None)
+    found = search.first_kept(given, given, [width, creep, other], given, 30)
     assert found.standing is None and found.refused["hysteresis"] == why
-    one = why == rounds.ONE_OF_A_KIND
-    assert fitted == ["hysteresis", *([] if one else ["bandwidth"]), "eddy_current"]
+    one = why == ONE_OF_A_KIND
+    assert tried == ["hysteresis", *([] if one else ["bandwidth"]), "eddy_current"]
     assert ("the law of hysteresis leaves" in found.refused["bandwidth"]) == one
 
 

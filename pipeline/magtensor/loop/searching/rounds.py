@@ -8,38 +8,25 @@ from dataclasses import dataclass, field, replace
 from magtensor.components import Component
 from magtensor.error_models.excitation import Excitation
 from magtensor.error_models.needs import missing
-from magtensor.errors import DataError
-from magtensor.loop.fitting.log_noise import channels_of
 from magtensor.loop.fitting.model import CHANNEL, Fitting, Record, State, generic
 from magtensor.loop.fitting.trial import Trial, on_the_folds_of, per_sample, trial
-from magtensor.loop.remainder.changing_matrix import channel_instead
 from magtensor.loop.remainder.tones import channels_of_the_line, tones
-from magtensor.loop.searching.adopting import adopt, narrowed, polished
-from magtensor.loop.searching.beginnings import at_its_limit, began_with_a_vector
-from magtensor.loop.searching.contribution import (
-    agrees,
-    eliminate,
-    happens_once,
-    of_all_alike,
-    share_of_the_field,
-    tones_of,
-    without_models,
-)
+from magtensor.loop.searching.contribution import eliminate, tones_of, without_models
 from magtensor.loop.searching.course_of_time import beside_time, rivals_in_time
 from magtensor.loop.searching.exchange import looked_at_again, simpler
 from magtensor.loop.searching.found import Step
 from magtensor.loop.searching.gates import Candidate
+from magtensor.loop.searching.keeping import ONE_OF_A_KIND, Fitted, fitted, why_not
 from magtensor.loop.searching.larger_law import part_of_a_larger_law
 from magtensor.loop.searching.latent import NAME, Sought, Source, renewed, sought, tried_source
 from magtensor.loop.searching.own_fit import at_their_own_fit
-from magtensor.loop.searching.profiling import already, repeatable
-from magtensor.loop.searching.rivals import containing, hardly_begun, overlaps, part_of, part_of_a_drift, simplest
+from magtensor.loop.searching.profiling import repeatable
+from magtensor.loop.searching.rivals import containing, overlaps, part_of, part_of_a_drift, simplest
 from magtensor.loop.searching.screening import candidates_of
 from magtensor.loop.searching.split import split
 from magtensor.loop.searching.which_channel import nearest
 
 MOST_OF_A_SAMPLE = 50.0  # log likelihood: half of the largest squared residual of a sample that noise may explain
-ONE_OF_A_KIND = "fitted, its settings are those of what is adopted already"  # its law is no single one
 ROUNDING = 1e-4  # mean square of the whitened residual: far below the least noise that any sensor is believed to have
 
 
@@ -110,9 +97,10 @@ class Rounds:
                 break
             candidates = self.candidates(state, record, how)
             open_ = len(testable(state.excitation, self.models))
-            adopted = _first_kept(record, standing, candidates, how, self.fixed, open_, self.say)
+            adopted = self.first_kept(record, standing, candidates, how, open_)
             step = adopted.step(state, candidates)
             steps.append(replace(step, screened=tuple(m.name for m in self.open_models(state))))
+            steps.extend(adopted.then)
             if adopted.standing is not None:
                 record, state = renewed(record, adopted.standing.state, how)
                 standing = replace(adopted.standing, state=state)
@@ -133,6 +121,91 @@ class Rounds:
             record, state, steps[-1] = found
             shared, standing = None, trial(record, state, how)
         return Ended(record, state, how, tuple(steps), shared)
+
+    def first_kept(
+        self,
+        record: Record,
+        before: Trial,
+        candidates: Sequence[Candidate],
+        how: Fitting,
+        models: int,
+        *,
+        with_others: bool = True,
+    ) -> Kept:
+        """Fit the candidates that pass, found among so many models, the best first, until one is kept; the first of
+        them that hurts a sensor may be kept with another beside it."""
+        refused: dict[str, str] = {}
+        while passing := [c for c in candidates if c.passes and c.model.name not in refused]:
+            best = max(passing, key=lambda c: c.assessment.gain.total)
+            possible = [c for c in candidates if c.predicts and c.model.name not in refused]
+            best = containing(best, possible, before.state)
+            chosen, rivals = simplest(best, possible, before.state)
+            if name := part_of_a_drift(chosen, candidates, before.state):
+                refused[chosen.model.name] = f"{name}, which lasts, predicts as much"
+                continue
+            if why := part_of_a_larger_law(chosen, before.state):
+                refused[chosen.model.name] = why
+                continue
+            chosen, channels = nearest(chosen, before.state, models)
+            for frequency in tones_of(chosen.model):
+                if channels := channels_of_the_line(before.state.excitation, frequency):
+                    rivals = tuple(sorted({*rivals, CHANNEL}))
+            time = beside_time(chosen, before.state)
+            if time.refused:
+                refused[chosen.model.name] = time.refused
+                continue
+            if not time.seen:
+                rivals = tuple(sorted({*rivals, *rivals_in_time(chosen, possible, before.state)}))
+            if self.say is not None:
+                self.say(f"adopting {chosen.model.name}")
+            tried = fitted(record, before, chosen, how)
+            if tried.hurt and with_others:
+                with_others = False  # a search beside it takes as long as a round
+                if two := self.with_another(record, before, chosen, tried, how):
+                    return replace(two, rivals=rivals, channels=channels, refused=refused)
+            if tried.after is None or tried.why:
+                refused[chosen.model.name] = tried.why
+                for c in candidates:
+                    if not c.passes or c.model.name in refused:
+                        continue
+                    if part_of(c, chosen, before.state):
+                        refused[c.model.name] = f"a small part of what {chosen.model.name} explains, which failed"
+                    elif tried.why == ONE_OF_A_KIND and overlaps(c, chosen, before.state):
+                        refused[c.model.name] = f"most of it is what the law of {chosen.model.name} leaves"
+                continue
+            after = tried.after
+            last, dropped = eliminate(record, after.state, how, self.fixed)
+            if dropped:
+                after = trial(record, last, how)
+            if chosen.model.name in dropped and len(last.adopted) <= len(before.state.adopted):
+                refused[chosen.model.name] = "fitted, it does not earn its place on held-out blocks"
+                continue
+            return Kept(after, chosen, rivals, channels, dropped, refused)
+        return Kept(None, refused=refused)
+
+    def with_another(
+        self, record: Record, before: Trial, chosen: Candidate, alone: Fitted, how: Fitting
+    ) -> Kept | None:
+        """A candidate kept together with what is found beside it, where alone it hurts a sensor; None where nothing is,
+        or both do not help those.
+
+        Of two effects that follow one trend each is fitted with the other's part in it, and so predicts blocks worse
+        than none.
+        """
+        if alone.after is None or len(alone.after.state.adopted) - self.fixed >= self.most_effects:
+            return None
+        state = with_lines(alone.after.state, record, self.lines)
+        candidates = self.candidates(state, record, how)
+        open_ = len(testable(state.excitation, self.models))
+        second = self.first_kept(record, replace(alone.after, state=state), candidates, how, open_, with_others=False)
+        both = second.standing
+        if both is None or second.dropped:
+            return None
+        before = on_the_folds_of(both, record, before, how)
+        helped = before.helped_by(both)
+        if before.hurt_by(both) or not set(alone.hurt) <= set(helped) or why_not(before, both, chosen, how):
+            return None
+        return Kept(both, chosen, then=(second.step(state, candidates),))
 
     def with_source(
         self, record: Record, state: State, how: Fitting, step: Step
@@ -173,11 +246,11 @@ def _exchanged(
     chosen = looked_at_again(without, other, models)
     if chosen is None:
         return None
-    after, _ = _kept(record, trial(record, without, how), chosen, how)
-    if after is None:
+    tried = fitted(record, trial(record, without, how), chosen, how)
+    if tried.after is None or tried.why:
         return None
     why = f"{chosen.model.name}, which has fewer coefficients, does as well beside the others"
-    return after, Step(without, (chosen,), chosen, (old,), refused={old: why})
+    return tried.after, Step(without, (chosen,), chosen, (old,), refused={old: why})
 
 
 def _source_instead(
@@ -205,8 +278,14 @@ def _source_instead(
 
 
 @dataclass(frozen=True)
-class _Kept:
-    """The outcome of a round; `standing` is None where nothing was kept."""
+class Kept:
+    """The outcome of a round.
+
+    Attributes:
+        standing: how the fit stands; None where nothing was kept.
+        chosen, rivals, channels, dropped, refused: as in `Step`.
+        then: the step of what was adopted with it, or nothing.
+    """
 
     standing: Trial | None
     chosen: Candidate | None = None
@@ -214,115 +293,13 @@ class _Kept:
     channels: tuple[str, ...] = ()
     dropped: tuple[str, ...] = ()
     refused: Mapping[str, str] = field(default_factory=dict)
+    then: tuple[Step, ...] = ()
 
     def step(self, before: State, candidates: Sequence[Candidate]) -> Step:
         """The round's story; what follows another channel than its candidate did stands in its place."""
         kept = self.chosen
         told = tuple(kept if kept and c.model.name == kept.model.name else c for c in candidates)
         return Step(before, told, kept, self.rivals, self.dropped, self.refused, channels=self.channels)
-
-
-def _first_kept(
-    record: Record,
-    before: Trial,
-    candidates: Sequence[Candidate],
-    how: Fitting,
-    fixed: int,
-    models: int,
-    say: Callable[[str], None] | None,
-) -> _Kept:
-    """Fit the candidates that pass, found among so many models, the best first, until one is kept."""
-    refused: dict[str, str] = {}
-    while passing := [c for c in candidates if c.passes and c.model.name not in refused]:
-        best = max(passing, key=lambda c: c.assessment.gain.total)
-        possible = [c for c in candidates if c.predicts and c.model.name not in refused]
-        best = containing(best, possible, before.state)
-        chosen, rivals = simplest(best, possible, before.state)
-        if name := part_of_a_drift(chosen, candidates, before.state):
-            refused[chosen.model.name] = f"{name}, which lasts, predicts as much"
-            continue
-        if why := part_of_a_larger_law(chosen, before.state):
-            refused[chosen.model.name] = why
-            continue
-        chosen, channels = nearest(chosen, before.state, models)
-        for frequency in tones_of(chosen.model):
-            if channels := channels_of_the_line(before.state.excitation, frequency):
-                rivals = tuple(sorted({*rivals, CHANNEL}))
-        time = beside_time(chosen, before.state)
-        if time.refused:
-            refused[chosen.model.name] = time.refused
-            continue
-        if not time.seen:
-            rivals = tuple(sorted({*rivals, *rivals_in_time(chosen, possible, before.state)}))
-        if say is not None:
-            say(f"adopting {chosen.model.name}")
-        after, why = _kept(record, before, chosen, how)
-        if after is None:
-            refused[chosen.model.name] = why
-            for c in candidates:
-                if not c.passes or c.model.name in refused:
-                    continue
-                if part_of(c, chosen, before.state):
-                    refused[c.model.name] = f"a small part of what {chosen.model.name} explains, which failed"
-                elif why == ONE_OF_A_KIND and overlaps(c, chosen, before.state):
-                    refused[c.model.name] = f"most of it is what the law of {chosen.model.name} leaves"
-            continue
-        last, dropped = eliminate(record, after.state, how, fixed)
-        if dropped:
-            after = trial(record, last, how)
-        if chosen.model.name in dropped and len(last.adopted) <= len(before.state.adopted):
-            refused[chosen.model.name] = "fitted, it does not earn its place on held-out blocks"
-            continue
-        return _Kept(after, chosen, rivals, channels, dropped, refused)
-    return _Kept(None, refused=refused)
-
-
-def _kept(record: Record, before: Trial, chosen: Candidate, how: Fitting) -> tuple[Trial | None, str]:
-    """The fit with a model, on fewer sensors where it hurts one that it does not help; None, and why, if it fails."""
-    try:
-        after = trial(record, polished(record, adopt(record, before.state, chosen, how), how), how)
-    except DataError as error:  # with coefficients that run away nothing is left to calibrate
-        return None, f"it cannot be fitted: {error.what.split(':')[0]}"
-    before = on_the_folds_of(after, record, before, how)
-    hurt, which = before.hurt_by(after), len(before.state.adopted)
-    if hurt:
-        own = after.state.adopted[which].sensors or tuple(record.sensors)
-        helped = [s for s in before.helped_by(after) if s in own]
-        if helped and set(chosen.terms.sensors) >= set(own):
-            after = trial(record, narrowed(record, after.state, which, tuple(helped), how), how)
-            before = on_the_folds_of(after, record, before, how)
-            hurt = before.hurt_by(after)
-    if hurt:
-        return None, f"fitted, it raises the held-out error of {', '.join(hurt)}"
-    model = after.state.adopted[which]
-    acts_on = model.sensors or tuple(record.sensors)
-    same = [a for a in after.state.adopted[:which] if set(a.sensors or record.sensors) & set(acts_on)]
-    two_channels = chosen.moved is None and channels_of(model, after.state.excitation)
-    if not two_channels and already(same, model.component, model.settings):
-        return None, ONE_OF_A_KIND
-    x = after.state.excitation
-    slow, channels = hardly_begun(chosen.model, x), sorted(channels_of(model, x))
-    if (slow or channels) and of_all_alike(after.state, which):
-        drift = "drifts" if slow else f"follows {' and '.join(channels)}"
-        return None, f"fitted, all sensors show it alike: an error of the base station that {drift} would look the same"
-    if hardly_begun(model, x) and ((not slow and chosen.moved is None) or began_with_a_vector(model)):
-        # of two of a kind one may be slow, and so may what was so at first sight, unless it is all that dies away
-        return None, "fitted, it lags by more than half of the survey: any drift would do as well"
-    if at_its_limit(model.component, model.settings, after.state.excitation):
-        return None, "fitted, it would have begun as far from what it follows as is possible: something else dies away"
-    if not agrees(after.state, which):
-        return None, "fitted, its coefficients are not what its settings assume"
-    if how.nominal is not None and (share := share_of_the_field(after.state, which)) > how.nominal.scale:
-        # what C takes back of it keeps it from being seen
-        return None, f"fitted, it makes {share:.0%} of the field: more than is assumed of a sensor"
-    if not before.likelier(after):
-        return None, "fitted together with the others, it leaves more than it takes away"
-    if happens_once(model):
-        terms = chosen.terms.only(i for i, s in enumerate(chosen.terms.sensors) if s in acts_on)
-        if channel := channel_instead(before.state, terms, chosen.assessment.colours):
-            why = f"C of {', '.join(acts_on)} follows {channel}, which explains more than something that happens once"
-            return None, why
-    return after, ""
 
 
 def testable(x: Excitation, models: Sequence[Component]) -> list[Component]:

@@ -1,0 +1,88 @@
+"""Whether a candidate is kept once it has been fitted: what it does to every sensor, and what its fit says of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from magtensor.errors import DataError
+from magtensor.loop.fitting.log_noise import channels_of
+from magtensor.loop.fitting.model import Fitting, Record
+from magtensor.loop.fitting.trial import Trial, on_the_folds_of, trial
+from magtensor.loop.remainder.changing_matrix import channel_instead
+from magtensor.loop.searching.adopting import adopt, narrowed, polished
+from magtensor.loop.searching.beginnings import at_its_limit, began_with_a_vector
+from magtensor.loop.searching.contribution import agrees, happens_once, of_all_alike, share_of_the_field
+from magtensor.loop.searching.gates import Candidate
+from magtensor.loop.searching.profiling import already
+from magtensor.loop.searching.rivals import hardly_begun
+
+ONE_OF_A_KIND = "fitted, its settings are those of what is adopted already"  # its law is no single one
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """A candidate that has been fitted together with the others.
+
+    Attributes:
+        after: how the fit stands; None where there is none.
+        why: it is not kept; "" if it is.
+        hurt: sensors whose held-out error rises, where that is why.
+    """
+
+    after: Trial | None
+    why: str = ""
+    hurt: tuple[str, ...] = ()
+
+
+def fitted(record: Record, before: Trial, chosen: Candidate, how: Fitting) -> Fitted:
+    """The fit with a candidate, on fewer sensors where it hurts one that it does not help."""
+    try:
+        after = trial(record, polished(record, adopt(record, before.state, chosen, how), how), how)
+    except DataError as error:  # with coefficients that run away nothing is left to calibrate
+        return Fitted(None, f"it cannot be fitted: {error.what.split(':')[0]}")
+    before = on_the_folds_of(after, record, before, how)
+    hurt, which = before.hurt_by(after), len(before.state.adopted)
+    if hurt:
+        own = after.state.adopted[which].sensors or tuple(record.sensors)
+        helped = [s for s in before.helped_by(after) if s in own]
+        if helped and set(chosen.terms.sensors) >= set(own):
+            fewer = trial(record, narrowed(record, after.state, which, tuple(helped), how), how)
+            before = on_the_folds_of(fewer, record, before, how)
+            if not before.hurt_by(fewer):
+                after, hurt = fewer, []
+    if hurt:
+        return Fitted(after, f"fitted, it raises the held-out error of {', '.join(hurt)}", tuple(hurt))
+    return Fitted(after, why_not(before, after, chosen, how))
+
+
+def why_not(before: Trial, after: Trial, chosen: Candidate, how: Fitting) -> str:
+    """What a fit without and with a candidate, and perhaps others behind it, says against the candidate; "" if nothing
+    does."""
+    x, which = after.state.excitation, len(before.state.adopted)
+    model = after.state.adopted[which]
+    acts_on = model.sensors or x.sensors
+    same = [a for a in after.state.adopted[:which] if set(a.sensors or x.sensors) & set(acts_on)]
+    two_channels = chosen.moved is None and channels_of(model, x)
+    if not two_channels and already(same, model.component, model.settings):
+        return ONE_OF_A_KIND
+    slow, channels = hardly_begun(chosen.model, x), sorted(channels_of(model, x))
+    if (slow or channels) and of_all_alike(after.state, which):
+        drift = "drifts" if slow else f"follows {' and '.join(channels)}"
+        return f"fitted, all sensors show it alike: an error of the base station that {drift} would look the same"
+    if hardly_begun(model, x) and ((not slow and chosen.moved is None) or began_with_a_vector(model)):
+        # of two of a kind one may be slow, and so may what was so at first sight, unless it is all that dies away
+        return "fitted, it lags by more than half of the survey: any drift would do as well"
+    if at_its_limit(model.component, model.settings, x):
+        return "fitted, it would have begun as far from what it follows as is possible: something else dies away"
+    if not agrees(after.state, which):
+        return "fitted, its coefficients are not what its settings assume"
+    if how.nominal is not None and (share := share_of_the_field(after.state, which)) > how.nominal.scale:
+        # what C takes back of it keeps it from being seen
+        return f"fitted, it makes {share:.0%} of the field: more than is assumed of a sensor"
+    if not before.likelier(after):
+        return "fitted together with the others, it leaves more than it takes away"
+    if happens_once(model):
+        terms = chosen.terms.only(i for i, s in enumerate(chosen.terms.sensors) if s in acts_on)
+        if channel := channel_instead(before.state, terms, chosen.assessment.colours):
+            return f"C of {', '.join(acts_on)} follows {channel}, which explains more than something that happens once"
+    return ""
