@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from magtensor.error_models.settings import Forms, Frequencies, Range, profiled
+from magtensor.error_models.settings import AsAWhole, Beginning, Forms, Frequencies, Range, profiled
 from magtensor.error_models.terms import Terms
 from magtensor.error_models.waveform import NAME
 from magtensor.loop.evidence.assessment import estimated, explained
@@ -28,6 +28,7 @@ from magtensor.loop.searching.contribution import (
     slices,
 )
 from magtensor.loop.searching.gates import Candidate
+from magtensor.loop.searching.profiling import of_ratios
 from magtensor.loop.searching.split import coefficients
 
 POLISH = 0.1  # of a setting, or of the width of a line, to either side
@@ -152,9 +153,9 @@ def _sensors_showing(state: State, which: int) -> tuple[str, ...] | None:
 def polished(record: Record, state: State, how: Fitting) -> State:
     """The forms of the models, what they began with and their settings on a range, sought once more now that everything
     is fitted together; a setting that is a little off leaves a residual that another model would be adopted for. Beside
-    one that has moved another form may be right."""
+    one that has moved another form may be right, and no lag be needed."""
     state = _at_rest(record, _as_they_began(record, _in_their_forms(record, state, how), how), how)
-    formed = _in_their_forms(record, state, how)
+    formed = _in_their_forms(record, _without_lags(record, state, how), how)
     return state if formed is state else _at_rest(record, formed, how)
 
 
@@ -178,6 +179,29 @@ def _at_rest(record: Record, state: State, how: Fitting) -> State:
         if not moved or len({a.name for a in state.adopted}) == len(state.adopted):
             break
     return state
+
+
+def _without_lags(record: Record, state: State, how: Fitting) -> State:
+    """The models without the lags that the data do not separate from none beside the others."""
+    for number, model in enumerate(state.adopted):
+        gain = _Beside.of(state, number)
+        best = dict(model.settings)
+        for name, grid in profiled(model.component).items():
+            if not of_ratios(grid) or grid.low > 0 or not best[name]:
+                continue
+            none = {**best, name: 0.0, **_of_the_lag(model, name)}
+            if gain(none) > gain(best) - SEPARATION / 2.0:
+                best = none
+        if best != model.settings:
+            state = _changed(record, state, number, best, how)
+    return state
+
+
+def _of_the_lag(model: Adopted, lag: str) -> dict[str, Any]:
+    """The other settings that say something of a lag, as they are without one."""
+    grids = profiled(model.component)
+    forms = {n: g.options[0] for n, g in grids.items() if isinstance(g, AsAWhole) and g.lag == lag}
+    return forms | {n: 0.0 for n, g in grids.items() if isinstance(g, Beginning) and g.lag == lag}
 
 
 def _in_their_forms(record: Record, state: State, how: Fitting) -> State:
