@@ -17,6 +17,7 @@ from magtensor.loop.searching.profiling import already
 from magtensor.loop.searching.rivals import hardly_begun
 
 ONE_OF_A_KIND = "fitted, its settings are those of what is adopted already"  # its law is no single one
+UNEARNED = "fitted, it does not earn its place on held-out blocks"
 
 
 @dataclass(frozen=True)

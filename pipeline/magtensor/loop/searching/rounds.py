@@ -16,7 +16,7 @@ from magtensor.loop.searching.course_of_time import beside_time, rivals_in_time
 from magtensor.loop.searching.exchange import looked_at_again, simpler
 from magtensor.loop.searching.found import Step
 from magtensor.loop.searching.gates import Candidate
-from magtensor.loop.searching.keeping import ONE_OF_A_KIND, Fitted, fitted, why_not
+from magtensor.loop.searching.keeping import ONE_OF_A_KIND, UNEARNED, Fitted, fitted, why_not
 from magtensor.loop.searching.larger_law import part_of_a_larger_law
 from magtensor.loop.searching.latent import NAME, Sought, Source, renewed, sought, tried_source
 from magtensor.loop.searching.own_fit import at_their_own_fit
@@ -133,7 +133,7 @@ class Rounds:
         with_others: bool = True,
     ) -> Kept:
         """Fit the candidates that pass, found among so many models, the best first, until one is kept; the first of
-        them that hurts a sensor may be kept with another beside it."""
+        them that fails on held-out blocks may be kept with another beside it."""
         refused: dict[str, str] = {}
         while passing := [c for c in candidates if c.passes and c.model.name not in refused]:
             best = max(passing, key=lambda c: c.assessment.gain.total)
@@ -158,14 +158,14 @@ class Rounds:
                 rivals = tuple(sorted({*rivals, *rivals_in_time(chosen, possible, before.state)}))
             if self.say is not None:
                 self.say(f"adopting {chosen.model.name}")
-            tried = fitted(record, before, chosen, how)
-            if tried.hurt and with_others:
+            tried, dropped = self.eliminated(record, before, chosen, fitted(record, before, chosen, how), how)
+            if (tried.hurt or tried.why == UNEARNED) and with_others:
                 with_others = False  # a search beside it takes as long as a round
                 if two := self.with_another(record, before, chosen, tried, how):
                     return replace(two, rivals=rivals, channels=channels, refused=refused)
             if tried.after is None or tried.why:
                 refused[chosen.model.name] = tried.why
-                for c in candidates:
+                for c in candidates if tried.why != UNEARNED else ():
                     if not c.passes or c.model.name in refused:
                         continue
                     if part_of(c, chosen, before.state):
@@ -173,21 +173,25 @@ class Rounds:
                     elif tried.why == ONE_OF_A_KIND and overlaps(c, chosen, before.state):
                         refused[c.model.name] = f"most of it is what the law of {chosen.model.name} leaves"
                 continue
-            after = tried.after
-            last, dropped = eliminate(record, after.state, how, self.fixed)
-            if dropped:
-                after = trial(record, last, how)
-            if chosen.model.name in dropped and len(last.adopted) <= len(before.state.adopted):
-                refused[chosen.model.name] = "fitted, it does not earn its place on held-out blocks"
-                continue
-            return Kept(after, chosen, rivals, channels, dropped, refused)
+            return Kept(tried.after, chosen, rivals, channels, dropped, refused)
         return Kept(None, refused=refused)
+
+    def eliminated(
+        self, record: Record, before: Trial, chosen: Candidate, tried: Fitted, how: Fitting
+    ) -> tuple[Fitted, tuple[str, ...]]:
+        """A candidate that is kept, without the models that are no longer needed beside it; and their names."""
+        if tried.after is None or tried.why:
+            return tried, ()
+        last, dropped = eliminate(record, tried.after.state, how, self.fixed)
+        if chosen.model.name in dropped and len(last.adopted) <= len(before.state.adopted):
+            return replace(tried, why=UNEARNED), ()
+        return (replace(tried, after=trial(record, last, how)) if dropped else tried), dropped
 
     def with_another(
         self, record: Record, before: Trial, chosen: Candidate, alone: Fitted, how: Fitting
     ) -> Kept | None:
-        """A candidate kept together with what is found beside it, where alone it hurts a sensor; None where nothing is,
-        or both do not help those.
+        """A candidate kept together with what is found beside it, where alone it fails on held-out blocks; None where
+        nothing is found, or both do not help the sensors that it hurts.
 
         Of two effects that follow one trend each is fitted with the other's part in it, and so predicts blocks worse
         than none.
