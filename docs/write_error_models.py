@@ -61,11 +61,11 @@ every recipe.
   (samples dense enough for rates of change), `gradient` (a field that differs between the sensors); `a|b` where one of
   two will do.
 - `pointwise=True` says that its regressors at a sample follow from that sample alone (channels and thermometers may
-  be lagged); settings with many values are then searched faster. `agrees=function(settings, coefficients, explained)`
-  says whether fitted coefficients are what the settings assume, where both mean one thing, and explain as large a
-  share of |b| - F as such coefficients must; the loop adopts nothing of which they are not. `about=function(settings,
-  coefficients)` gives the settings about which a model that is linear only nearby is to be made for such
-  coefficients.
+  be lagged); settings with many values are then searched faster. `agrees=function(x, settings, coefficients,
+  explained)` says whether fitted coefficients are what the settings assume, where both mean one thing, and explain as
+  large a share of |b| - F as such coefficients must; the loop adopts nothing of which they are not.
+  `about=function(settings, coefficients)` gives the settings about which a model that is linear only nearby is to be
+  made for such coefficients.
 
 `check_error_model(my_model)` of `magtensor.loop.checker` gives a list of everything that is wrong with it; put
 `assert check_error_model(my_model) == []` into your tests.

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from pydantic import BaseModel
 
 F = TypeVar("F", bound=Callable[..., Any])
+Agrees = Callable[[Any, Mapping[str, Any], Any, float], bool]  # of an excitation, settings, coefficients, their share
 
 MARK = "__magtensor__"
 KINDS = ("stage", "method", "reader", "metric", "error_model")
@@ -79,7 +80,7 @@ class Component:
     effect: Literal["", "instrument", "site", "reference"] = ""  # of an error model: what it is an error of
     typical: str = ""  # of an error model: its usual magnitude
     pointwise: bool = False  # of an error model: its regressors at a sample need no other sample
-    agrees: Callable[[Mapping[str, Any], Any, float], bool] | None = None  # of an error model: what was fitted with it
+    agrees: Agrees | None = None  # of an error model: what was fitted with it
     about: Callable[[Mapping[str, Any], Any], Mapping[str, Any]] | None = None  # settings that coefficients ask for
     several: bool = False  # of a stage: it also fits the further surveys that a recipe names
     long: Callable[..., Any] | None = None  # of a stage: what it does with a recording longer than the memory
@@ -264,7 +265,7 @@ def error_model(
     source: str = "",
     typical: str = "",
     pointwise: bool = False,
-    agrees: Callable[[Mapping[str, Any], Any, float], bool] | None = None,
+    agrees: Agrees | None = None,
     about: Callable[[Mapping[str, Any], Any], Mapping[str, Any]] | None = None,
 ) -> Callable[[F], F]:
     """Mark ``function(x: Excitation, *, settings) -> Terms`` as an error model.
@@ -279,8 +280,9 @@ def error_model(
         typical: its usual magnitude, in words.
         pointwise: its regressors at a sample follow from that sample alone (logged channels may be lagged), so that its
             settings are searched on a few samples only, without the others being computed.
-        agrees: of settings, fitted coefficients (P,) and the share of |b| - F that they explain, white noise apart,
-            whether these are what they must be to each other; the loop adopts nothing of which they are not.
+        agrees: of the excitation, settings, fitted coefficients (P,) and the share of |b| - F that they explain, white
+            noise apart, whether these are what they must be to each other; the loop adopts nothing of which they are
+            not.
         about: of settings and fitted coefficients (P,), the settings about which a model that is linear only nearby
             has to be made for such coefficients; the loop moves there where the data allow it.
     """

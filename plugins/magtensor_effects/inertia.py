@@ -106,7 +106,7 @@ def lag_step(x: Excitation, *, time_s: EventTime = 0.0, span_s: Span = 3600.0) -
     return x.late(((x.elapsed >= time_s) & (x.elapsed <= span_s)).astype(float), "s", "lag")
 
 
-def _shortens(_: Mapping[str, Any], coefficients: Array, __: float) -> bool:
+def _shortens(_: Excitation, __: Mapping[str, Any], coefficients: Array, ___: float) -> bool:
     """A mean is shorter than what it is made of, in every sensor if each has a coefficient."""
     return bool((coefficients > 0).all())
 

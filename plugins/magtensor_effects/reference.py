@@ -20,7 +20,7 @@ LONGEST_S = 7200.0  # two time zones
 BETWEEN_NOISE_AND_DELAY = 0.75  # of the lag: half of it is what noise makes, all of it a delay
 
 
-def _more_than_noise(_: Mapping[str, Any], coefficients: Array, explained: float) -> bool:
+def _more_than_noise(_: Excitation, __: Mapping[str, Any], coefficients: Array, explained: float) -> bool:
     """Whether an excess of the recorded variation explains more than it would if it were noise of the base station.
 
     Noise w beside a variation v is recorded and not seen at the site: the excess is fitted as k = w^2 / (v^2 + w^2) and
@@ -51,7 +51,7 @@ def reference_scale(x: Excitation) -> Terms:
     return x.on_reference(0.01 * (f - f.mean()), "%", "excess")
 
 
-def _delayed_by_its_lag(settings: Mapping[str, Any], coefficients: Array, _: float) -> bool:
+def _delayed_by_its_lag(_: Excitation, settings: Mapping[str, Any], coefficients: Array, __: float) -> bool:
     """Whether the delay is the lag that the difference was taken over.
 
     Noise of the base station, slow or fast, seems to be explained by half of that difference, for it is in both.

@@ -4,7 +4,8 @@ World frame as in `attitude`, which also tells the rotation between the platform
 the common one. They are modelled while calibrating and never taken off another survey's field.
 """
 
-from typing import Annotated
+from collections.abc import Mapping
+from typing import Annotated, Any
 
 import numpy as np
 from pydantic import Field
@@ -17,6 +18,9 @@ from magtensor.error_models.settings import EventTimes, Orders, Range
 from magtensor.error_models.terms import Terms, joined
 from magtensor.tensor.elements import COMPONENTS, NINE_OF_FIVE
 from magtensor.tensor.geometry import field_polynomials, term_names
+
+MOST_OF_A_DEGREE = 3.0  # rms, over what lower degrees make
+FEW = 500  # attitudes that tell how much that is
 
 
 def _places(x: Excitation) -> Array:
@@ -52,9 +56,26 @@ def site_gradient(x: Excitation) -> Terms:
     return joined(found)
 
 
+def _falls_off(x: Excitation, settings: Mapping[str, Any], coefficients: Array, _: float) -> bool:
+    """Whether the highest degree makes no more of the field at the sensors than three times what all lower ones make.
+
+    Of a dipole at distance d the field of degree n is to that of degree n - 1 as (n + 1) r / ((n - 1) d) or less: at
+    most twice as large for a source just outside the sensors' reach r, where the series ends to converge. A law of the
+    attitude that is of high degree and nothing else is no source.
+    """
+    places = _places(x.at(np.arange(0, len(x.time), max(len(x.time) // FEW, 1))))
+    fields = [np.zeros_like(places) for _ in range(2, int(settings["degree"]) + 1)]
+    named = [(degree, name) for degree in range(2, len(fields) + 2) for name in term_names(degree)]
+    for (degree, name), coefficient in zip(named, coefficients, strict=True):
+        fields[degree - 2] += coefficient * _harmonic(name, places)
+    *lower, highest = (float(np.sum(field**2)) for field in fields)
+    return highest <= MOST_OF_A_DEGREE**2 * sum(lower)
+
+
 @error_model(
     "site",
     needs=("attitude", "position"),
+    agrees=_falls_off,
     source="harmonic potential about the centre of the rig",
     typical="10 to 100 nT/m indoors",
 )

@@ -13,6 +13,7 @@ from magtensor.calibration.types import Array, ArrayCalibration
 from magtensor.error_models.delays import cleared, lateness, on_time, unseen
 from magtensor.error_models.terms import Terms
 from magtensor.error_models.waveform import NAME, bends, course_of, too_little_shows
+from magtensor.errors import DataError
 from magtensor.loop.correcting.another_survey import as_begun_here
 from magtensor.loop.fitting.model import Adopted, Record, State
 from magtensor.loop.fitting.refit import without
@@ -21,6 +22,7 @@ from magtensor.tensor.geometry import array_design
 
 MOST_STEPS = 8
 SETTLED_NT = 1e-4
+LARGE_NT = 1.0  # what steps that grow may still move the median output by
 
 
 def corrected_raw(
@@ -35,6 +37,10 @@ def corrected_raw(
     Outputs that come late are brought back to their time; what was not recorded before an end is missing then. The
     other effects depend on the field that is being sought: b is found from the outputs as they are, the effects from b,
     and so on until neither moves. Effects of the site belong to the calibration's place and are left alone here.
+
+    Raises
+    ------
+    DataError: the steps grow.
 
     Parameters
     ----------
@@ -70,12 +76,21 @@ def corrected_raw(
     own = [pair for terms, pair in zip(each, own, strict=True) if terms.delay is None]
     own = as_begun_here(record, calibration, own)
     models, theta = [model for model, _ in own], [t for _, t in own]
+    last = np.inf
     for _ in range(MOST_STEPS if own else 0):
         after = cleared(record.raw, record.time, record.run, terms_for(raw, models), theta)
-        moved = float(np.nanmax(np.abs(after - raw), initial=0.0))
+        moves = np.abs(after - raw)
         raw = after
-        if moved < SETTLED_NT:
+        if float(np.nanmax(moves, initial=0.0)) < SETTLED_NT:
             break
+        usual = float(np.nanmedian(moves))  # a spike may be where a law has no inverse
+        if usual > max(last, LARGE_NT):
+            raise DataError(
+                f"the effects ({', '.join(m.name for m in models)}) cannot be taken off: a step moves the outputs by "
+                f"{usual:.3g} nT, the one before by {last:.3g}",
+                hint="coefficients so large are no small errors: calibrate without these effects",
+            )
+        last = usual
     return raw
 
 

@@ -269,7 +269,7 @@ def agrees(state: State, place: int) -> bool:
     if at_its_limit(model.component, model.settings, state.excitation):
         return False
     test = model.component.agrees
-    return test is None or test(model.settings, state.theta[place], explained_share(state, place))
+    return test is None or test(state.excitation, model.settings, state.theta[place], explained_share(state, place))
 
 
 def explained_share(state: State, place: int) -> float:
@@ -285,6 +285,28 @@ def explained_share(state: State, place: int) -> float:
     its = without - left
     both = 0.5 * (without[1:] @ its[:-1] + without[:-1] @ its[1:])
     return float(both / lasting) if lasting > 0 else 1.0
+
+
+def share_of_differences(state: State, place: int) -> float:
+    """What an adopted model makes of differences of the field between the sensors, rms over these; 0 where it does not
+    need them.
+
+    A law that is of first order in an error of positions, or in what one sensor does to another, makes little of them.
+    If it makes much, it amplifies the noise, and fields that are not uniform are lost.
+    """
+    model = state.adopted[place]
+    if "gradient" not in model.component.declared({}).needs:
+        return 0.0
+    x = state.excitation
+    differs = np.random.default_rng(0).standard_normal((len(x.sensors), 3))
+    differs -= differs.mean(axis=0)
+    made = [
+        model.terms(replace(x, site=np.broadcast_to(site, x.field.shape))).contribution(
+            state.theta[place], differs.size
+        )
+        for site in (np.zeros_like(differs), differs)
+    ]
+    return float(np.sqrt(np.mean((made[1] - made[0]) ** 2) / np.mean(differs**2)))
 
 
 def share_of_the_field(state: State, place: int) -> float:

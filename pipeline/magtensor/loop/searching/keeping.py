@@ -11,12 +11,19 @@ from magtensor.loop.fitting.trial import Trial, on_the_folds_of, trial
 from magtensor.loop.remainder.changing_matrix import channel_instead
 from magtensor.loop.searching.adopting import adopt, narrowed, polished
 from magtensor.loop.searching.beginnings import at_its_limit, began_with_a_vector
-from magtensor.loop.searching.contribution import agrees, happens_once, of_all_alike, share_of_the_field
+from magtensor.loop.searching.contribution import (
+    agrees,
+    happens_once,
+    of_all_alike,
+    share_of_differences,
+    share_of_the_field,
+)
 from magtensor.loop.searching.gates import Candidate
 from magtensor.loop.searching.profiling import already
 from magtensor.loop.searching.rivals import hardly_begun
 
 ONE_OF_A_KIND = "fitted, its settings are those of what is adopted already"  # its law is no single one
+MOST_OF_DIFFERENCES = 0.1  # positions wrong by a tenth of the array, where its law ends to be of first order
 UNEARNED = "fitted, it does not earn its place on held-out blocks"
 
 
@@ -77,6 +84,8 @@ def why_not(before: Trial, after: Trial, chosen: Candidate, how: Fitting) -> str
         return "fitted, it would have begun as far from what it follows as is possible: something else dies away"
     if not agrees(after.state, which):
         return "fitted, its coefficients are not what its settings assume"
+    if (share := share_of_differences(after.state, which)) > MOST_OF_DIFFERENCES:
+        return f"fitted, it makes {share:.0%} of what differs between the sensors: no small error"
     if how.nominal is not None and (share := share_of_the_field(after.state, which)) > how.nominal.scale:
         # what C takes back of it keeps it from being seen
         return f"fitted, it makes {share:.0%} of the field: more than is assumed of a sensor"
