@@ -9,6 +9,7 @@ from magtensor.loop.fitting.log_noise import channels_of
 from magtensor.loop.fitting.model import Fitting, Record
 from magtensor.loop.fitting.trial import Trial, on_the_folds_of, trial
 from magtensor.loop.remainder.changing_matrix import channel_instead
+from magtensor.loop.remainder.curve_of_a_channel import another_curve, event_of_a_curve
 from magtensor.loop.searching.adopting import adopt, narrowed, polished
 from magtensor.loop.searching.beginnings import at_its_limit, began_with_a_vector
 from magtensor.loop.searching.contribution import (
@@ -91,7 +92,12 @@ def why_not(before: Trial, after: Trial, chosen: Candidate, how: Fitting) -> str
         return f"fitted, it makes {share:.0%} of the field: more than is assumed of a sensor"
     if not before.likelier(after):
         return "fitted together with the others, it leaves more than it takes away"
+    theta = chosen.assessment.theta[-chosen.terms.count :]
+    if channel := another_curve(before.state, chosen.model, chosen.terms, theta, chosen.assessment.colours):
+        return f"any curve of {channel} explains more"
     if happens_once(model):
+        if channel := event_of_a_curve(before.state, chosen.terms, theta, chosen.assessment.colours):
+            return f"a curve of {channel} explains as much: what is adopted may miss its law"
         terms = chosen.terms.only(i for i, s in enumerate(chosen.terms.sensors) if s in acts_on)
         if channel := channel_instead(before.state, terms, chosen.assessment.colours):
             return f"C of {', '.join(acts_on)} follows {channel}, which explains more than something that happens once"
