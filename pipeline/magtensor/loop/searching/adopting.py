@@ -99,8 +99,8 @@ def _spare(state: State, which: int, sensors: tuple[str, ...]) -> bool:
 def _sufficient(state: State, which: int) -> tuple[str, ...] | None:
     """The one sensor whose coefficients explain all that a model does, where others can stand in for them.
 
-    If only differences between sensors are seen, one that turned is like all others turned the other way: every
-    coefficient is significant, or none is. None where no sensor suffices, or several do.
+    If only differences between sensors are seen, or little else, one that turned is like all others turned the other
+    way: every coefficient is significant, or none is. None where no sensor suffices, or several do.
     """
     from scipy.special import chdtri
 
@@ -109,7 +109,9 @@ def _sufficient(state: State, which: int) -> tuple[str, ...] | None:
     found = []
     for sensor in sorted(set(owners) - {""}):
         gone, seen, lost = _without_others(state, which, (sensor,))
-        if 0 < seen < gone and lost < float(chdtri(seen, KEEP_ALPHA)):
+        if not seen or lost >= float(chdtri(seen, KEEP_ALPHA)):
+            continue
+        if seen < gone or _spare(state, which, (sensor,)):
             found.append(sensor)
     return tuple(found) if len(found) == 1 else None
 
