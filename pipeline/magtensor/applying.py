@@ -97,6 +97,7 @@ def apply(
         "NOT taken off": "not_taken_off",
         "total field as it was read, which fits better than without": "total_field_as_read",
         "extrapolated": "extrapolated",
+        "taken to go straight": "bridged",
         "begins anew with this survey": "begins_anew",
         "taken to begin in equilibrium, which four sensors of known positions would show": "in_equilibrium",
         "NOT taken off, for the lengths of this survey's vectors refute it": "not_on_this_survey",
@@ -178,6 +179,7 @@ def apply_and_refine(
     from magtensor.effect_errors import taken_off
     from magtensor.loop.correcting.stored import (
         begun_anew,
+        bridged,
         cleaned,
         extrapolated,
         in_equilibrium,
@@ -224,6 +226,7 @@ def apply_and_refine(
         words = {
             "not_taken_off": here.left_in,
             "extrapolated": extrapolated(before, calibration, adopted, origins),
+            "bridged": bridged(before, adopted),
             "begins_anew": begun_anew(adopted, calibration),
             "in_equilibrium": in_equilibrium(adopted, survey),
             "not_on_this_survey": here.refuted,

@@ -94,7 +94,8 @@ def corrected(calibration: ArrayCalibration, survey: Survey, **words: str) -> di
     """`calibrated/b` of every sample and, where the total field is known, `residual/total_field`, after and before.
 
     `words` become attributes where they say something: `not_taken_off` names effects that are still in it,
-    `extrapolated` those taken off beyond what the calibration has seen, `begins_anew` those of a time that goes on from
+    `extrapolated` those taken off beyond what the calibration has seen, `bridged` those that follow a channel which is
+    missing for a while, `begins_anew` those of a time that goes on from
     the calibration's survey to another one as a rule, and with this one began again, `in_equilibrium` responses that
     lag and are taken to have begun so, `not_on_this_survey` those that the survey's own outputs refute,
     `total_field_as_read` those of the base station that were left in its total field.

@@ -155,7 +155,7 @@ def read(path: Path) -> Provenance:
     try:
         with h5py.File(path, "r") as file:
             if GROUP not in file:
-                raise UsageError(f"{path}: has no group /{GROUP}; only results of magtensor can be run again")
+                raise UsageError(f"{path}: has no group /{GROUP}: it is no result.nc or calibration.nc of magtensor")
             return Provenance.from_attributes(dict(file[GROUP].attrs))
     except OSError as error:
         raise UsageError(f"{path}: cannot be read as HDF5: {error}") from error

@@ -186,7 +186,7 @@ def test_files_that_are_no_results(own, tmp_path, capsys):
     with h5py.File(plain, "w") as file:
         file["x"] = 1
     assert status_of(["run", str(plain)]) == 2
-    assert "only results of magtensor can be run again" in capsys.readouterr().err
+    assert "it is no result.nc or calibration.nc of magtensor" in capsys.readouterr().err
     whole = (own.folder / "out/result.nc").read_bytes()
     plain.write_bytes(whole[: len(whole) // 2])
     assert status_of(["run", str(plain)]) == 2

@@ -101,6 +101,29 @@ def test_an_effect_beyond_what_the_calibration_has_seen_is_told(
     assert beyond is not None and float(beyond[1]) > 2.0
 
 
+def test_a_channel_that_is_missing_for_a_while_is_told(
+    tmp_path: Path, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What every third row lacks is not missing; two minutes without a reading are told."""
+
+    def sparse(file: h5py.File) -> None:
+        values = file["current_heater"][()]
+        values[::3] = np.nan
+        file["current_heater"][...] = values
+
+    def lost(file: h5py.File) -> None:
+        values, time = file["current_heater"][()], file["time"][()]
+        values[(time - time[0] > 100.0) & (time - time[0] < 220.0)] = np.nan
+        file["current_heater"][...] = values
+
+    magtensor.close_loop(folder / "heated.h5", search=["current_field"]).calibration.save(tmp_path / "c.nc")
+    for change, said in ((sparse, ""), (lost, "current_field: current_heater is missing from 100 to 220 s")):
+        path = changed(folder, "hot.h5", change)
+        assert status_of(["apply", str(tmp_path / "c.nc"), str(path), "--output", str(tmp_path / "a.nc")]) == 0
+        out = capsys.readouterr().out
+        assert said in out and ("taken to go straight" in out) is bool(said)
+
+
 def test_what_had_no_part_in_the_calibration_was_not_seen_by_it(folder: Path) -> None:
     path = folder / "heated.h5"
     survey = load_as(read_plan(RECIPE, survey=path), path)

@@ -28,6 +28,8 @@ from magtensor.survey.times import split_since
 
 LATE = "the log of what an effect follows is late"
 MOST_BEYOND = 0.25  # of the range that a calibration has seen of a channel
+MISSES = 10.0  # times as long as between its readings: then a channel is missing
+LONG_PART = 0.01  # of a survey, at least
 
 
 def effect_variables(
@@ -299,6 +301,29 @@ def extrapolated(survey: Survey, calibration: Survey, adopted: Sequence[Adopted]
             if beyond > MOST_BEYOND * (high - low):
                 units = f" {record.units[channel]}" if record.units[channel] else ""
                 words.append(f"{effect.name}: {what} goes {beyond:.3g}{units} beyond what the calibration has seen")
+    return "; ".join(dict.fromkeys(words))
+
+
+def bridged(survey: Survey, adopted: Sequence[Adopted]) -> str:
+    """Which effects follow a channel that is missing for a while, and when: it is taken to go straight there; "" where
+    none is."""
+    time = np.asarray(survey.time, dtype=float)
+    words = []
+    for effect in (a for a in adopted if a.component.effect != "site"):
+        for name, mark in profiled(effect.component).items():
+            channel = str(effect.settings.get(name, "")) if isinstance(mark, AnyChannel) else ""
+            if channel not in survey or len(survey.values(channel)) != len(time):
+                continue
+            values = np.asarray(survey.values(channel), dtype=float).reshape(len(time), -1)
+            read = time[np.isfinite(values).all(axis=1)]
+            if len(read) < 2:
+                continue
+            steps = np.diff(np.concatenate([time[:1], read, time[-1:]]))
+            usual = float(np.median(np.diff(read)))
+            if steps.max() > max(MISSES * usual, LONG_PART * (time[-1] - time[0])):
+                first = int(np.argmax(steps))
+                begin, end = np.concatenate([time[:1], read, time[-1:]])[first : first + 2] - time[0]
+                words.append(f"{effect.name}: {channel} is missing from {begin:.4g} to {end:.4g} s after the start")
     return "; ".join(dict.fromkeys(words))
 
 
