@@ -51,8 +51,9 @@ class ChangingMatrix:
     def words(self) -> str:
         """For the verdict."""
         how = "with time" if self.waveform == SLOW else f"with {self.waveform}"
+        amount = f"{self.rms:.3g} nT rms" if self.rms > 0 else "a part"  # seen in noise made white alone
         return (
-            f"{self.rms:.3g} nT rms of it goes with the field in a way that changes {how}: "
+            f"{amount} of it goes with the field in a way that changes {how}: "
             f"C of {' or '.join(self.sensors)} is not constant"
         )
 
