@@ -32,6 +32,14 @@ def direction_series(x: Excitation) -> Array:
     return np.column_stack(columns)
 
 
+def turning_series(x: Excitation) -> Array:
+    """(N, 3): the way in which the field's direction turns, of length 1 however fast: what has a memory of where it was
+    lies behind by an amount that does not grow with the rate."""
+    rate = x.derivative(_unit(x.field[:, 0]))
+    size = np.linalg.norm(rate, axis=1, keepdims=True)
+    return np.divide(rate, size, out=np.zeros_like(rate), where=size > 0)
+
+
 def attitude_series(x: Excitation) -> Array:
     """(N, K): `direction_series`, and every logged attitude, acceleration and rate, alone and times the direction."""
     u = _unit(x.field[:, 0])

@@ -6,7 +6,7 @@ import numpy as np
 
 from magtensor.calibration.types import Array
 from magtensor.error_models.acting import AXES
-from magtensor.error_models.direction import attitude_series, curve_series, direction_series
+from magtensor.error_models.direction import attitude_series, curve_series, direction_series, turning_series
 from magtensor.error_models.excitation import Excitation
 from magtensor.error_models.terms import Terms, joined
 from magtensor.loop.evidence.assessment import WHITE, Colours
@@ -43,8 +43,8 @@ def predictable_from_direction(state: State) -> float:
     """The part of the whitened residual, rms, that follows the field's direction and its rate of change; 0 if none.
 
     Any smooth effect of attitude, named or not, is a polynomial of the direction to first order: second and third
-    degree and the rate of change, with coefficients of every output's own, are fitted on some blocks and judged on
-    others. Noise makes such a model worse than none.
+    degree, the rate of change and, for what has a memory, the way of the turning alone, with coefficients of every
+    output's own, are fitted on some blocks and judged on others. Noise makes such a model worse than none.
     """
     if len(state.residual.affine) < LEAST_FOR_DIRECTION * 3 * len(state.excitation.sensors):
         return 0.0
@@ -194,8 +194,8 @@ def _predictable(state: State, terms: Terms) -> float:
 
 
 def _direction_terms(x: Excitation) -> Terms:
-    """Every output's own coefficients of monomials of the field's direction and of its rate of change."""
-    series = direction_series(x)
+    """Every output's own coefficients of monomials of the field's direction, of its rate of change and of its way."""
+    series = np.hstack([direction_series(x), turning_series(x)])
     outputs, k = 3 * len(x.sensors), series.shape[1]
     part_output, part_series = np.repeat(np.arange(outputs), k), np.tile(np.arange(k), outputs)
     return Terms(
