@@ -111,6 +111,14 @@ def test_sensor_names_have_a_default_and_other_groups_are_mentioned(tmp_path: Pa
     assert "truth/ (1 dataset)" in " ".join(survey.attributes["notes"])
 
 
+def test_a_channel_of_another_length_is_left_out_with_the_reason(tmp_path: Path) -> None:
+    winch = ((), np.arange(17.0), {"units": "m"})
+    survey = read_canonical(plain_file(tmp_path / "w.h5", winch=winch))
+    rows = len(survey.time)
+    assert f"left out: winch (17 rows, the survey has {rows})" in " ".join(survey.attributes["notes"])
+    assert "winch" not in survey
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [

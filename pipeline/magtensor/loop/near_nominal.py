@@ -74,6 +74,8 @@ def begun(inquire: Inquire, how: Fitting, nominal: Nominal | None) -> Inquiry:
 
 
 def _refused(first: DataError, second: DataError) -> DataError:
+    if second.what == first.what:  # what no prior helps against
+        return second
     also = f"with sensors taken near nominal: {second.what}"
     hint = "; ".join(p for p in (first.hint, also, second.hint) if p)
     return type(first)(first.what, where=first.where or second.where, hint=hint)

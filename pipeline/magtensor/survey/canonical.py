@@ -95,7 +95,7 @@ def survey_from(tables: Tables) -> Survey:
             continue
         found = _variable(name, column, sizes, notes)
         if found is None:
-            ignored.append(name)
+            ignored.append(name if column.shape[:1] in ((), (len(time),)) else f"{name} ({_rows(column, len(time))})")
         else:
             variables[name] = found
     variables.update(_reference(tables, epoch, ignored))
@@ -105,6 +105,10 @@ def survey_from(tables: Tables) -> Survey:
     if notes:
         attributes["notes"] = notes
     return Survey.build(variables, attributes)
+
+
+def _rows(column: Column, count: int) -> str:
+    return f"{column.shape[0]} rows, the survey has {count}"
 
 
 def _groups(names: list[str]) -> list[str]:
