@@ -58,14 +58,9 @@ def drifting(law: str) -> Callable[[Path], None]:
     return change
 
 
-@pytest.mark.parametrize("seed", [31, *(pytest.param(seed, marks=pytest.mark.long) for seed in (32, 35))])
-@pytest.mark.parametrize(
-    "law",
-    [
-        "logarithm",
-        *(pytest.param(law, marks=pytest.mark.long) for law in LAWS if law != "logarithm"),
-    ],
-)
+@pytest.mark.long
+@pytest.mark.parametrize("seed", [31, 32, 35])
+@pytest.mark.parametrize("law", LAWS)
 def test_a_thermometer_that_settles_is_not_accused_of_a_drift(law: str, seed: int, tmp_path: Path) -> None:
     told = verdict_of(tmp_path, scenario(seed, **SHORT), drifting(law), MODELS)
     assert adopted_names(told) <= {"offset_drift", "warm_up"}

@@ -60,7 +60,7 @@ LAWS: dict[str, Callable[[Array], Array]] = {
 }
 
 
-@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("law", ["dead zone", *(pytest.param(law, marks=pytest.mark.long) for law in list(LAWS)[1:])])
 def test_what_a_line_leaves_of_another_law_is_no_event(law: str) -> None:
     """The best stretch of what is left is that of a curve of the channel."""
     values = course(3)
@@ -70,7 +70,7 @@ def test_what_a_line_leaves_of_another_law_is_no_event(law: str) -> None:
     assert channel == "wind"
 
 
-@pytest.mark.parametrize("size", [0.4, 1.5])
+@pytest.mark.parametrize("size", [0.4, pytest.param(1.5, marks=pytest.mark.long)])
 def test_an_event_is_no_curve_of_a_channel(size: float) -> None:
     """An offset for a while beside what is in proportion to a channel, weak and strong."""
     values = course(4)
@@ -83,7 +83,7 @@ def test_an_event_is_no_curve_of_a_channel(size: float) -> None:
     assert events_of(linear_state(logged(6, while_, wind=values)), "offset_while")[1] == ""  # nothing follows it
 
 
-@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("law", ["dead zone", *(pytest.param(law, marks=pytest.mark.long) for law in list(LAWS)[1:])])
 def test_the_law_of_one_channel_is_not_that_of_another(law: str) -> None:
     """A channel that nearly goes with the one whose law it is."""
     wind = course(7)

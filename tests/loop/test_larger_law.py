@@ -58,6 +58,7 @@ def test_a_small_part_of_what_follows_the_attitude_is_none(name: str, kink_nT: f
     assert ("so does what it leaves" in part_of_a_larger_law(candidate, state)) is refused
 
 
+@pytest.mark.long
 def test_three_laws_of_the_attitude_are_all_adopted(tmp_path: Path) -> None:
     names = ["nonlinearity_cubic", "nonlinearity_quadratic", "eddy_current"]
     effects = [{"type": n, "rms_nT": rms} for n, rms in zip(names, (4.0, 1.0, 0.6), strict=True)]
