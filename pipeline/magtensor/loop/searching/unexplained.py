@@ -35,6 +35,7 @@ ALPHA = 0.001  # of each of the tests
 OF_A_LINE = 0.1  # of the square of what is left above the noise: less than that says nothing of its cause
 MUCH = 3.0  # times the white noise of an output: no base station beside a site differs by so much unnoticed
 TWICE = 2.0  # what the slow noise of the sensors, known from few frequencies, makes of it
+MANY_FLAGGED = 0.01  # of the samples: of what is left, some is in these
 LOUD = 2.0  # times the usual noise
 NOISE = "what is left is noise: white, and slow noise of each sensor alone or of the reference"
 
@@ -86,7 +87,8 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
             + (f": {MODEL}, which cannot be tested without {lacks}, would look like this" if lacks else "")
         )
     if words:
-        size = f"{excess:.3g} nT rms above the white noise, {_where(state)}"
+        in_use = " at the samples in use" if flagged.mean() > MANY_FLAGGED else ""
+        size = f"{excess:.3g} nT rms above the white noise{in_use}, {_where(state)}"
         words.insert(0, size if excess else "in sum no more than the white noise")
     beside = loud_words(state, record, found.how) + unread_words(state, record)
     if small := [c.model.name for c in seen if c.of_second_order]:
