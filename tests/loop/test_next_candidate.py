@@ -34,6 +34,7 @@ def test_what_is_dropped_at_once_does_not_end_the_search(tmp_path: Path, monkeyp
         return rounds.without_models(record, state, [len(state.adopted) - 1], how), (first[0],)
 
     monkeypatch.setattr(rounds, "eliminate", strict)
+    monkeypatch.setattr(rounds.Rounds, "with_another", lambda *_: None)
     survey = scenario(33, *EFFECTS, motion=BASE["motion"] | {"duration_s": 600.0})
     told = verdict_of(tmp_path, survey, models=[str(e["type"]) for e in EFFECTS])
 

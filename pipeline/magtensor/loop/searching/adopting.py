@@ -184,8 +184,12 @@ def _at_rest(record: Record, state: State, how: Fitting) -> State:
 
 
 def _without_lags(record: Record, state: State, how: Fitting) -> State:
-    """The models without the lags that the data do not separate from none beside the others."""
+    """The models without the lags that the data do not separate from none beside the others; of two of one kind, what
+    one lacks the other makes up for."""
+    names = [model.name for model in state.adopted]
     for number, model in enumerate(state.adopted):
+        if names.count(model.name) > 1:
+            continue
         gain = _Beside.of(state, number)
         best = dict(model.settings)
         for name, grid in profiled(model.component).items():
