@@ -82,16 +82,21 @@ def attitude_part(state: State, added: Array) -> float:
 
 
 def attitude_square(state: State, left: Residual) -> float:
-    """Sum of squares of what a residual across, at the state's samples, shows of laws of the attitude and of any curve
-    of the field along each axis, beyond what as many columns follow of anything."""
+    """Sum of squares of what laws of the attitude, and any curve of the field along each axis, predict of a residual
+    across, at the state's samples, on contiguous folds that they were not fitted to: noise, slow or not, is no part of
+    it."""
     assert left.across is not None
     x, residual = state.excitation, state.residual
     series = np.hstack([made(x)[residual.samples] for made in (attitude_series, curve_series)])
     own = residual.free_across
     basis, size, _ = np.linalg.svd(series - own @ (own.T @ series), full_matrices=False)
-    basis = basis[:, size > ROUNDING * size[0]]
-    found, every = float(np.sum((basis.T @ left.across) ** 2)), float(np.sum(left.across**2))
-    return max(found - every * basis.shape[1] / len(left.across), 0.0)
+    basis, values = basis[:, size > ROUNDING * size[0]], left.across
+    total, predicted = basis.T @ values, 0.0
+    for part in np.array_split(np.arange(len(values)), FOLDS):
+        known = np.eye(basis.shape[1]) - basis[part].T @ basis[part]  # of the other folds
+        theta = np.linalg.lstsq(known, total - basis[part].T @ values[part], rcond=ROUNDING)[0]
+        predicted += float(np.sum(values[part] ** 2) - np.sum((values[part] - basis[part] @ theta) ** 2))
+    return max(predicted, 0.0)
 
 
 def converter_words(state: State) -> list[str]:
