@@ -97,6 +97,20 @@ def test_the_law_of_one_channel_is_not_that_of_another(law: str) -> None:
         assert another_curve(state, model, one.terms, theta, one.assessment.colours) == other
 
 
+def test_what_follows_a_vector_has_no_curve_to_be_compared_with() -> None:
+    """An acceleration that acts through one of its components, beside a channel that goes with it."""
+    wind = course(7)
+    record = logged(9, 6.0 * wind, wind=wind)
+    shaken = np.column_stack([wind, *0.01 * np.random.default_rng(2).standard_normal((2, SAMPLES))])
+    record = replace(record, logged={**record.logged, "acceleration": shaken}, units={"wind": "1", "acceleration": "1"})
+    record = replace(record, origins={"wind": np.zeros(()), "acceleration": np.zeros(3)})
+    state = linear_state(record)
+    one = found(state, "channel_response", channel="acceleration", power=1, times_field=False)
+    model = Adopted(Registry.load().find("error_model", "channel_response"), one.model.settings)
+    theta = one.assessment.theta[-one.terms.count :]
+    assert another_curve(state, model, one.terms, theta, one.assessment.colours) == ""
+
+
 def test_lines_between_knots_make_any_line() -> None:
     """What is in proportion to a channel is a sum of them, but for the constant that the offsets take."""
     values = np.random.default_rng(1).uniform(-3.0, 5.0, 400)

@@ -318,11 +318,10 @@ def bridged(survey: Survey, adopted: Sequence[Adopted]) -> str:
             read = time[np.isfinite(values).all(axis=1)]
             if len(read) < 2:
                 continue
-            steps = np.diff(np.concatenate([time[:1], read, time[-1:]]))
-            usual = float(np.median(np.diff(read)))
-            if steps.max() > max(MISSES * usual, LONG_PART * (time[-1] - time[0])):
-                first = int(np.argmax(steps))
-                begin, end = np.concatenate([time[:1], read, time[-1:]])[first : first + 2] - time[0]
+            known = np.concatenate([time[:1], read, time[-1:]]) - time[0]
+            first = int(np.argmax(np.diff(known)))
+            begin, end = known[first : first + 2]
+            if end - begin > max(MISSES * float(np.median(np.diff(read))), LONG_PART * known[-1]):
                 words.append(f"{effect.name}: {channel} is missing from {begin:.4g} to {end:.4g} s after the start")
     return "; ".join(dict.fromkeys(words))
 

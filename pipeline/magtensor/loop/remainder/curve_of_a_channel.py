@@ -43,7 +43,7 @@ def another_curve(state: State, model: Adopted, terms: Terms, theta: Array, colo
     """The channel any curve of which explains more than a model does that follows another one, and more than any curve
     of that one; "" where none does. Parameters as above."""
     x = state.excitation
-    own = channels_of(model, x)
+    own = {name for name in channels_of(model, x) if not x.is_vector(name)}
     if not own:
         return ""
     others = [(n, v) for n, v in x.logged.items() if not x.is_vector(n)]

@@ -93,12 +93,13 @@ def why_not(before: Trial, after: Trial, chosen: Candidate, how: Fitting) -> str
     if not before.likelier(after):
         return "fitted together with the others, it leaves more than it takes away"
     theta = chosen.assessment.theta[-chosen.terms.count :]
-    if channel := another_curve(before.state, chosen.model, chosen.terms, theta, chosen.assessment.colours):
+    seen = chosen.before or before.state  # at the samples of its terms
+    if channel := another_curve(seen, chosen.model, chosen.terms, theta, chosen.assessment.colours):
         return f"any curve of {channel} explains more"
     if happens_once(model):
-        if channel := event_of_a_curve(before.state, chosen.terms, theta, chosen.assessment.colours):
+        if channel := event_of_a_curve(seen, chosen.terms, theta, chosen.assessment.colours):
             return f"a curve of {channel} explains as much: what is adopted may miss its law"
         terms = chosen.terms.only(i for i, s in enumerate(chosen.terms.sensors) if s in acts_on)
-        if channel := channel_instead(before.state, terms, chosen.assessment.colours):
+        if channel := channel_instead(seen, terms, chosen.assessment.colours):
             return f"C of {', '.join(acts_on)} follows {channel}, which explains more than something that happens once"
     return ""
