@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
 from magtensor.errors import UsageError
 
 PROCESSES = "MAGTENSOR_PROCESSES"  # of the environment; one process where it is not set
+END_WITH_PARENT = 1  # PR_SET_PDEATHSIG of prctl(2)
 
 Item = TypeVar("Item")
 Found = TypeVar("Found")
@@ -47,7 +49,9 @@ def shared_out(work: Callable[[Item], Found], items: Sequence[Item]) -> list[Fou
 
     _shared = work, items
     try:
-        with ProcessPoolExecutor(processes, mp_context=get_context("fork"), initializer=_begin) as pool:
+        with ProcessPoolExecutor(
+            processes, mp_context=get_context("fork"), initializer=_begin, initargs=(os.getpid(),)
+        ) as pool:
             return list(pool.map(_of_number, range(len(items))))
     finally:
         _shared = None
@@ -60,9 +64,15 @@ def _wanted() -> int:
     return int(wanted)
 
 
-def _begin() -> None:
+def _begin(parent: int) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C at the terminal is for the process that shares out
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    if sys.platform == "linux":  # elsewhere they wait for a process that was killed
+        import ctypes
+
+        ctypes.CDLL(None).prctl(END_WITH_PARENT, signal.SIGTERM)
+        if os.getppid() != parent:  # it ended before
+            os._exit(1)
 
 
 def _of_number(number: int) -> Any:

@@ -91,6 +91,15 @@ def test_mistake_of_metrics_hides_no_other(own):
     assert "stages[1].judge.level: input should be a valid integer" in found[1]
 
 
+def test_a_list_holds_names_and_such_with_options(own):
+    """Each once: of several of one name only the last would be left."""
+    recipe = own.recipe("  - start\n  - judge: {metrics: [noise: {band: 2.0}, flagged]}\n")
+    assert [*read_plan(recipe).stages[1].described["metrics"]] == ["noise", "flagged"]
+    found = own.mistakes("  - start\n  - judge: {metrics: [noise, noise: {band: 2.0}]}\n")
+    assert "stages[1].judge.metrics: names noise twice" in found[0]
+    assert "each a name or `metric: {options}`" in own.mistakes("  - start\n  - judge: {metrics: [[noise]]}\n")[0]
+
+
 @pytest.mark.parametrize(
     ("option", "words"),
     [

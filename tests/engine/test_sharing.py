@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import os
+import signal
+import subprocess
+import sys
+import time
 from collections.abc import Iterator
 
 import numpy as np
@@ -59,3 +63,36 @@ def test_a_number_of_processes_that_is_none_is_refused(wanted: str, monkeypatch:
 
     with pytest.raises(UsageError, match=f"{PROCESSES}={wanted}: a whole number"):
         shared_out(lambda k: k, range(3))
+
+
+BUSY = """
+import os, time
+from magtensor.sharing import shared_out
+shared_out(lambda _: (os.write(1, b"%d\\n" % os.getpid()), time.sleep(60)), range(2))
+"""
+
+
+def alive(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    with open(f"/proc/{process}/stat") as stat:
+        return stat.read().rpartition(")")[2].split()[0] != "Z"  # what nobody has waited for is no more
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells a process that its parent has ended")
+@pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGKILL])
+def test_they_end_with_the_process_that_shares_out(how: signal.Signals) -> None:
+    environment = os.environ | {PROCESSES: "2"}
+    with subprocess.Popen([sys.executable, "-c", BUSY], stdout=subprocess.PIPE, text=True, env=environment) as run:
+        assert run.stdout is not None
+        workers = [int(run.stdout.readline()) for _ in range(2)]
+        assert all(alive(worker) for worker in workers)
+        run.send_signal(how)
+        run.wait(10)
+        for _ in range(100):
+            if not any(alive(worker) for worker in workers):
+                break
+            time.sleep(0.05)
+    assert not any(alive(worker) for worker in workers)

@@ -19,6 +19,10 @@ from magtensor.registry import Registry
 from magtensor.survey.sections import SurveySection
 from magtensor.survey.source import Source
 
+SEVERAL = {  # why a name is given once, and what would be right
+    "error_model": "are found by the search, or adopted by `decisions` of close_loop",
+    "metric": "would be the same figure twice",
+}
 TOP_KEYS = ("title", "description", "authors", "references", "survey", "verify", "plugins", "stages")
 
 
@@ -363,14 +367,22 @@ class _Planner:
     def collection(
         self, kind: str, option: str, wanted: Any, at: Location
     ) -> tuple[dict[str, Any], dict[str, Any], list[Component]] | None:
-        """A mapping `name: {options}`, or a list of names, or nothing for every metric or error model there is."""
+        """A mapping `name: {options}`, or a list of names and of such, or nothing for every metric or error model there
+        is."""
         word = kind.replace("_", " ")
         if wanted is None:
             wanted = self.registry.names(kind)
-        if isinstance(wanted, (list, tuple)) and all(isinstance(w, str) for w in wanted):
-            wanted = {w: {} for w in wanted}
+        if isinstance(wanted, (list, tuple)) and all(isinstance(w, str) or _is_one(w) for w in wanted):
+            each = [w if isinstance(w, dict) else {w: {}} for w in wanted]
+            names = [str(name) for one in each for name in one]
+            if twice := sorted({name for name in names if names.count(name) > 1}):
+                self.problems.add(
+                    (*at, option), f"names {', '.join(twice)} twice; several of one {word} {SEVERAL[kind]}"
+                )
+                return None
+            wanted = {name: options for one in each for name, options in one.items()}
         if not isinstance(wanted, dict):
-            self.problems.add((*at, option), f"must be a list of {word}s, or a mapping `{word}: {{options}}`")
+            self.problems.add((*at, option), f"must be a list of {word}s, each a name or `{word}: {{options}}`")
             return None
         bound: dict[str, Any] = {}
         described: dict[str, Any] = {}
@@ -419,6 +431,11 @@ class _Planner:
 def readers(registry: Registry) -> dict[str, Component]:
     """The reader components by name."""
     return {name: registry.find("reader", name) for name in registry.names("reader")}
+
+
+def _is_one(value: Any) -> bool:
+    """Whether it is a mapping `name: {options}`."""
+    return isinstance(value, dict) and len(value) == 1
 
 
 def _values(model: Any) -> dict[str, Any]:
