@@ -24,8 +24,9 @@ from magtensor.loop.fitting.model import Adopted, State
 def white_noise(values: Array, run: NDArray[np.int_]) -> Array:
     """White noise of a channel (N,) or (N, K), one figure for each column.
 
-    From second differences within runs, by their median, so that jumps count as signal; at least the noise of the
-    resolution where the values are rounded.
+    From second differences within runs, by their median, so that jumps count as signal; less where values two apart
+    differ by more than neighbours do, as those of a channel that wanders: white noise is the part that does not grow.
+    At least the noise of the resolution where the values are rounded.
     """
     columns = values.reshape(len(values), -1)
     out = np.zeros(columns.shape[1])
@@ -34,12 +35,23 @@ def white_noise(values: Array, run: NDArray[np.int_]) -> Array:
     within = run[2:] == run[:-2]
     if within.any():
         second = np.abs(np.diff(columns, n=2, axis=0)[within]) / np.sqrt(6.0)
-        out = MAD_TO_SIGMA * np.median(second, axis=0)
+        out = np.minimum(MAD_TO_SIGMA * np.median(second, axis=0), _that_does_not_grow(columns, run))
     for j, column in enumerate(columns.T):
         steps = np.abs(np.diff(column))
         steps = steps[steps > 1e-9 * max(float(np.ptp(column)), 1e-300)]
         if out[j] == 0 and len(steps):
             out[j] = steps.min() / np.sqrt(12.0)
+    return out
+
+
+def _that_does_not_grow(columns: Array, run: NDArray[np.int_]) -> Array:
+    """(K,) white noise from how values one and two apart differ: s^2 from 2 s^2 + a and 2 s^2 + 2 a."""
+    squares = []
+    for apart in (1, 2):
+        within = run[apart:] == run[:-apart]
+        steps = np.abs(columns[apart:] - columns[:-apart])[within]
+        squares.append((MAD_TO_SIGMA * np.median(steps, axis=0)) ** 2)
+    out: Array = np.sqrt(np.maximum(2.0 * squares[0] - squares[1], 0.0) / 2.0)
     return out
 
 
