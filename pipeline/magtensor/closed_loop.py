@@ -196,9 +196,12 @@ def summary(verdict: dict[str, Any]) -> str:
         evidence = one["evidence"]
         settings = ", ".join(f"{k} {_short(v)}" for k, v in one["settings"].items() if not isinstance(v, list))
         rivals, others = one["indistinguishable_from"], one.get("channels_as_good", [])
+        bends = one["settings"].get("bends", [])
         before, after = evidence["held_out_rms_before_nT"], evidence["held_out_rms_after_nT"]
         words = [
             *([settings] if settings else []),
+            *([f"by a curve that bends at {', '.join(f'{b:.3g}' for b in bends)}"] if bends else []),
+            *([f"most like channel {one['most_like_channel']}"] if "most_like_channel" in one else []),
             f"on {', '.join(one['sensors'])}" if one["sensors"] else "on all sensors alike",
             f"held-out residual {figure(before)} -> {figure(after)} nT",
             *([f"z {evidence['z']:.3g}"] if evidence["z"] is not None else []),

@@ -109,14 +109,18 @@ def sentence(outcome: dict[str, Any]) -> str:
 
 
 def _named(adopted: Sequence[Mapping[str, Any]]) -> list[str]:
-    """The error models, a response to any channel with that channel, and how often where more than once."""
-    names = [
-        f"{a['error_model']} of {channel}"
-        if a["error_model"] == "channel_response" and (channel := a.get("settings", {}).get("channel"))
-        else str(a["error_model"])
-        for a in adopted
-    ]
+    """The error models, with the channel of a response to any, and how often where more than once."""
+    names = [_with_its_channel(a) for a in adopted]
     return [f"{count} x {name}" if count > 1 else name for name, count in Counter(names).items()]
+
+
+def _with_its_channel(a: Mapping[str, Any]) -> str:
+    name, settings = str(a["error_model"]), a.get("settings", {})
+    if name == "channel_response" and (channel := settings.get("channel")):
+        name = f"{name} of {channel}"
+    if like := a.get("most_like_channel"):
+        name = f"{name} (most like channel {like})"
+    return f"{name} by a curve" if settings.get("bends") else name
 
 
 def _disagreement(outcome: dict[str, Any]) -> str:

@@ -7,11 +7,13 @@ from pydantic import Field
 
 from magtensor.components import error_model
 from magtensor.error_models.acting import AXES
+from magtensor.error_models.curves import along_a_curve
 from magtensor.error_models.excitation import Excitation
-from magtensor.error_models.settings import AnyChannel, Choice, Frequencies, Range
+from magtensor.error_models.settings import AnyChannel, Choice, Forms, Frequencies, Range
 from magtensor.error_models.terms import Terms, joined
+from magtensor.errors import UsageError
 from magtensor.units import convert
-from magtensor_effects.forms import AtStart, Delayed, OfField, Smooth
+from magtensor_effects.forms import AtStart, BentPower, Delayed, OfField, Smooth
 
 ATTITUDE_ANGLES = ("roll*", "pitch*", "yaw*", "heading*", "azimuth*", "course*", "latitude*", "longitude*")
 ENCODER = AnyChannel("encoder*", without=ATTITUDE_ANGLES, or_units="rad", vectors=False)
@@ -74,17 +76,32 @@ def channel_response(
         Field(description="true: it changes the scale factors; false: it adds to the offsets"),
     ] = False,
     of_field: OfField = False,
+    lower_powers: Annotated[
+        bool,
+        Forms((False, True)),
+        Field(description="true: its lower powers beside it, as of a power about another zero; of one component only"),
+    ] = False,
+    bends: BentPower = (),
 ) -> Terms:
-    """The output follows a power of any logged channel, through a lag, as an offset or as a factor.
+    """The output follows a power of any logged channel, or any curve of it, through a lag, as an offset or as a factor.
 
     The power is about zero for a current and for what goes both ways, else about the channel's mean. One coefficient an
     axis; nine a sensor for a channel with three components. Rivals: the model that names the cause
     (`temperature_offset`, `current_field`, ...), identical to this one at power 1.
     """
     name = ANY.pick(x, channel)
-    course = x.channel(name, lag_s, delayed, smooth, at_start) ** power
+    course = x.channel(name, lag_s, delayed, smooth, at_start)
+    if bends and x.is_vector(name):
+        raise UsageError(f"bends: {name} has three components; a curve is of a channel with one")
     per_unit = f"({x.units[name]})^{power}" if power > 1 else x.units[name]
+    columns = [("", per_unit, course**power)]
+    for k in range(1, power if lower_powers else 1):
+        columns.append((f"power {k} ", f"({x.units[name]})^{k}" if k > 1 else x.units[name], course**k))
+    columns += [(label, x.units[name], column) for label, column in along_a_curve(course, bends)[1:]]
     if not times_field:
-        return x.matrices(course, f"nT/{per_unit}") if x.is_vector(name) else x.offsets(course, f"nT/{per_unit}")
-    columns = [(f"{AXES[i]} ", c) for i, c in enumerate(course.T)] if x.is_vector(name) else [("", course)]
-    return joined([x.scales(1e-6 * c, f"ppm/{per_unit}", label, of_field=of_field) for label, c in columns])
+        if x.is_vector(name):
+            return x.matrices(course**power, f"nT/{per_unit}")
+        return joined([x.offsets(column, f"nT/{unit}", label) for label, unit, column in columns])
+    if x.is_vector(name):
+        columns = [(f"{AXES[i]} ", per_unit, column) for i, column in enumerate((course**power).T)]
+    return joined([x.scales(1e-6 * c, f"ppm/{unit}", label, of_field=of_field) for label, unit, c in columns])

@@ -4,7 +4,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from magtensor.error_models.settings import AsAWhole, Beginning, Cleaned, Forms
+from magtensor.error_models.settings import AsAWhole, Beginning, Bends, Cleaned, Forms
 
 Delayed = Annotated[
     bool,
@@ -31,3 +31,9 @@ OfField = Annotated[
     Forms((False, True)),
     Field(description="true: acts on what the axis makes of the field; false: on its whole output, offset and all"),
 ]
+
+BENDS = Field(description="values of the channel at which the response bends, straight in between; none: by its powers")
+
+Bent = Annotated[tuple[float, ...], Bends(), BENDS]
+BentPower = Annotated[tuple[float, ...], Bends(instead=("power", "lower_powers")), BENDS]
+BentOrder = Annotated[tuple[float, ...], Bends(instead=("order",)), BENDS]

@@ -5,10 +5,11 @@ from typing import Annotated
 from pydantic import Field
 
 from magtensor.components import error_model
+from magtensor.error_models.curves import along_a_curve
 from magtensor.error_models.excitation import Excitation
 from magtensor.error_models.settings import AnyChannel, Range
-from magtensor.error_models.terms import Terms
-from magtensor_effects.forms import Delayed, OfField, Smooth
+from magtensor.error_models.terms import Terms, joined
+from magtensor_effects.forms import Bent, Delayed, OfField, Smooth
 
 CURRENT = AnyChannel("current_*", or_units="A", vectors=False)
 SUPPLY = AnyChannel("supply*", or_units="V", vectors=False)
@@ -34,33 +35,41 @@ def current_field(
     ] = 0.0,
     smooth: Smooth = False,
     delayed: Delayed = False,
+    bends: Bent = (),
 ) -> Terms:
-    """The magnetic field of a logged current: a constant vector at each sensor, in proportion to it.
+    """The magnetic field of a logged current: a constant vector at each sensor, in proportion to it, or to any curve of
+    it (a rectifier, a meter that saturates).
 
     One coefficient an axis: the field as the axis senses it, C times the field at the sensor (by which a simulated one
     is given). Rivals: other currents that switch together; `supply_offset`, for the supply sags under the current.
     """
     name = CURRENT.pick(x, channel)
-    return x.offsets(x.channel(name, lag_s, delayed, smooth), f"nT/{x.units[name]}")
+    course = x.channel(name, lag_s, delayed, smooth)
+    return joined([x.offsets(c, f"nT/{x.units[name]}", label) for label, c in along_a_curve(course, bends)])
 
 
 @error_model("instrument", needs=("supply*",), source="dependence of the excitation on the supply", typical="10 ppm/V")
-def supply_scale(x: Excitation, *, channel: Supply = "", smooth: Smooth = False, of_field: OfField = False) -> Terms:
+def supply_scale(
+    x: Excitation, *, channel: Supply = "", smooth: Smooth = False, of_field: OfField = False, bends: Bent = ()
+) -> Terms:
     """Each axis's scale factor follows the supply voltage.
 
     The voltage times the axis's own output. Rivals: `supply_offset` where the attitude hardly changes;
     `scale_drift` for a battery that discharges steadily.
     """
     name = SUPPLY.pick(x, channel)
-    return x.scales(1e-6 * x.channel(name, smooth=smooth), f"ppm/{x.units[name]}", of_field=of_field)
+    course = x.channel(name, smooth=smooth)
+    units = f"ppm/{x.units[name]}"
+    return joined([x.scales(1e-6 * c, units, label, of_field=of_field) for label, c in along_a_curve(course, bends)])
 
 
 @error_model("instrument", needs=("supply*",), source="dependence of the electronics on the supply", typical="a nT/V")
-def supply_offset(x: Excitation, *, channel: Supply = "", smooth: Smooth = False) -> Terms:
+def supply_offset(x: Excitation, *, channel: Supply = "", smooth: Smooth = False, bends: Bent = ()) -> Terms:
     """Each axis's offset follows the supply voltage.
 
     Rivals: `current_field` of the current under which the supply sags; `supply_scale` where the attitude hardly
     changes; `offset_drift` for a battery that discharges steadily.
     """
     name = SUPPLY.pick(x, channel)
-    return x.offsets(x.channel(name, smooth=smooth), f"nT/{x.units[name]}")
+    course = x.channel(name, smooth=smooth)
+    return joined([x.offsets(c, f"nT/{x.units[name]}", label) for label, c in along_a_curve(course, bends)])

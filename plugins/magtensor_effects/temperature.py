@@ -4,11 +4,13 @@ from typing import Annotated
 
 from pydantic import Field
 
+from magtensor.calibration.types import Array
 from magtensor.components import error_model
+from magtensor.error_models.curves import along_a_curve
 from magtensor.error_models.excitation import Excitation
 from magtensor.error_models.settings import AnyChannel, Beginning, Orders, Range
 from magtensor.error_models.terms import Terms, joined
-from magtensor_effects.forms import AtStart, Delayed, OfField
+from magtensor_effects.forms import AtStart, BentOrder, Delayed, OfField
 
 THERMOMETER = AnyChannel("temperature*", or_units="degC", vectors=False)
 
@@ -38,6 +40,7 @@ def temperature_offset(
     lag_s: ThermalLag = 0.0,
     delayed: Delayed = False,
     at_start: AtStart = 0.0,
+    bends: BentOrder = (),
 ) -> Terms:
     """Each axis's offset follows the temperature of the sensor, which lags the thermometer.
 
@@ -48,7 +51,8 @@ def temperature_offset(
     """
     name = THERMOMETER.pick(x, channel)
     course = x.thermometer(name, lag_s, delayed, at_start)
-    return joined([x.offsets(course**k, f"nT/{units}", label) for k, units, label in _powers(x.units[name], order)])
+    columns = _columns(course, x.units[name], order, bends)
+    return joined([x.offsets(column, f"nT/{units}", label) for units, label, column in columns])
 
 
 @error_model(
@@ -67,6 +71,7 @@ def temperature_scale(
     delayed: Delayed = False,
     at_start: AtStart = 0.0,
     of_field: OfField = False,
+    bends: BentOrder = (),
 ) -> Terms:
     """Each axis's scale factor follows the temperature of the sensor, which lags the thermometer.
 
@@ -75,8 +80,8 @@ def temperature_scale(
     """
     name = THERMOMETER.pick(x, channel)
     course = x.thermometer(name, lag_s, delayed, at_start)
-    powers = _powers(x.units[name], order)
-    return joined([x.scales(1e-6 * course**k, f"ppm/{units}", label, of_field=of_field) for k, units, label in powers])
+    columns = _columns(course, x.units[name], order, bends)
+    return joined([x.scales(1e-6 * c, f"ppm/{units}", label, of_field=of_field) for units, label, c in columns])
 
 
 @error_model(
@@ -112,6 +117,10 @@ def temperature_rate(
     return x.offsets(x.thermometer(name) - x.thermometer(name, tau_s, at_start=at_start), f"nT/{x.units[name]}")
 
 
-def _powers(units: str, order: int) -> list[tuple[int, str, str]]:
-    """Powers up to an order, with the units of each and what the names of its coefficients begin with."""
-    return [(k, units if k == 1 else f"({units})^{k}", "" if k == 1 else f"power {k} ") for k in range(1, order + 1)]
+def _columns(course: Array, unit: str, order: int, bends: tuple[float, ...]) -> list[tuple[str, str, Array]]:
+    """Powers of a temperature up to an order and how far it is beyond each bend: the unit of each, what the names of
+    its coefficients begin with, and its values."""
+    powers = [
+        (unit if k == 1 else f"({unit})^{k}", "" if k == 1 else f"power {k} ", course**k) for k in range(1, order + 1)
+    ]
+    return powers + [(unit, label, column) for label, column in along_a_curve(course, bends)[1:]]

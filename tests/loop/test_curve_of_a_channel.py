@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from magtensor.loop.fitting.model import Adopted, Fitting, Record, State
 from magtensor.loop.fitting.refit import joint_state
-from magtensor.loop.remainder.curve_of_a_channel import another_curve, event_of_a_curve, hats
+from magtensor.loop.remainder.curve_of_a_channel import another_curve, event_of_a_curve
 from magtensor.loop.searching import by_hand
 from magtensor.loop.searching.gates import ALPHA, Candidate
 from magtensor.registry import Registry
@@ -109,14 +109,3 @@ def test_what_follows_a_vector_has_no_curve_to_be_compared_with() -> None:
     model = Adopted(Registry.load().find("error_model", "channel_response"), one.model.settings)
     theta = one.assessment.theta[-one.terms.count :]
     assert another_curve(state, model, one.terms, theta, one.assessment.colours) == ""
-
-
-def test_lines_between_knots_make_any_line() -> None:
-    """What is in proportion to a channel is a sum of them, but for the constant that the offsets take."""
-    values = np.random.default_rng(1).uniform(-3.0, 5.0, 400)
-    for knots in (5, 9):
-        columns = hats(values, knots)
-        assert columns.shape == (400, knots - 1)
-        whole = np.column_stack([columns, np.ones(400)])
-        left = values - whole @ np.linalg.lstsq(whole, values, rcond=None)[0]
-        assert np.abs(left).max() < 1e-9

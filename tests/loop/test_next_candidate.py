@@ -139,6 +139,7 @@ def test_what_another_width_of_an_adopted_law_explains_is_no_other_effect(
     monkeypatch.setattr(rounds, "containing", lambda best, *_: best)
     monkeypatch.setattr(rounds, "simplest", unchanged)
     monkeypatch.setattr(rounds, "nearest", unchanged)
+    monkeypatch.setattr(rounds, "_outdone", lambda *_: "")
     monkeypatch.setattr(rounds, "part_of_a_larger_law", lambda *_: "")
     monkeypatch.setattr(rounds, "part_of_a_drift", lambda *_: "")
     monkeypatch.setattr(rounds, "beside_time", lambda *_: BesideTime(True))
@@ -153,6 +154,41 @@ def test_what_another_width_of_an_adopted_law_explains_is_no_other_effect(
     one = why == ONE_OF_A_KIND
     assert tried == ["hysteresis", *([] if one else ["bandwidth"]), "eddy_current"]
     assert ("the law of hysteresis leaves" in found.refused["bandwidth"]) == one
+
+
+def test_of_one_name_the_curve_of_another_channel_is_still_tried(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A response to one channel is refused, for any curve of another one explains more; that curve has its turn, once,
+    though it has the same name."""
+    line, curve = candidate("channel_response", 9.0), candidate("channel_response", 5.0)
+    for each in (line, curve):
+        each.predicts = True
+    asked: list[str] = []
+
+    def curves(channel: str, *_: Any) -> list[Any]:
+        asked.append(channel)
+        return [curve]
+
+    unchanged: Any = lambda chosen, *_: (chosen, ())  # noqa: E731
+    for name, does in {
+        "fitted": lambda *_: Fitted(None, "refused"),
+        "containing": lambda best, *_: best,
+        "simplest": unchanged,
+        "nearest": unchanged,
+        "part_of_a_larger_law": lambda *_: "",
+        "part_of_a_drift": lambda *_: "",
+        "beside_time": lambda *_: BesideTime(True),
+        "_outdone": lambda chosen, _: "wind" if chosen is line else "",
+        "by_any_law_of": curves,
+    }.items():
+        monkeypatch.setattr(rounds, name, does)
+    given: Any = SimpleNamespace(state=SimpleNamespace(excitation=None, adopted=()))
+    monkeypatch.setattr(rounds.Rounds, "open_models", lambda *_: [])
+    search = rounds.Rounds([], 0, 8, 0.005, None, None)
+    told: list[str] = []
+    search.say = told.append
+    found = search.first_kept(given, given, [line], given, 30)
+    assert found.standing is None and asked == ["wind"] and told == ["adopting channel_response"]
+    assert found.refused == {"channel_response": "refused"}
 
 
 @pytest.mark.parametrize(("rises", "part"), [(lambda t: t, "offset_drift"), (lambda t: np.sign(t - 0.1), "")])

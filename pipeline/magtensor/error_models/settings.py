@@ -205,6 +205,19 @@ class AsAWhole(Forms):
 
 
 @dataclass(frozen=True)
+class Bends(Forms):
+    """Values of a channel at which the line that a response follows bends: in between it is straight, and beyond the
+    first and the last it goes on. None is searched with; they are found once nothing else explains what is left.
+
+    Attributes:
+        instead: the settings that say which powers of the channel are followed, at their first option beside bends.
+    """
+
+    options: tuple[Any, ...] = ((),)
+    instead: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
 class Beginning:
     """What a response that lags had from before the survey began, in the units of its channel.
 

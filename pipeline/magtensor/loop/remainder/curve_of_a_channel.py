@@ -2,17 +2,18 @@
 
 A dead zone, a root, a square with a sign: of such a law of a channel a power explains most, and what is left of it
 rises and falls as the channel does. A stretch of it looks like an event, and a slow part like the law of another cause.
-Along the direction that the effect has at the sensors, straight lines between knots of the channel are asked how much
+Along the direction that the effect has at the sensors, straight lines between values of the channel are asked how much
 they explain on blocks that lie between others.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 
 from magtensor.calibration.types import Array
+from magtensor.error_models.curves import along_a_curve, bends_of
 from magtensor.error_models.excitation import Excitation
 from magtensor.error_models.terms import Terms
 from magtensor.loop.evidence.assessment import Colours
@@ -23,20 +24,32 @@ from magtensor.loop.fitting.model import Adopted, State
 from magtensor.loop.fitting.separation import SEPARATION
 from magtensor.loop.remainder.changing_matrix import BLOCKS, LEAST_SAMPLES
 
-KNOTS = (5, 9, 17)
+PIECES = (4, 8, 16)
+HALF = 0.5
 ONE_WAVEFORM = 0.9  # of the square of what an effect adds: then its outputs share one
 
 
 def event_of_a_curve(state: State, terms: Terms, theta: Array, colours: Colours) -> str:
-    """The channel of an adopted model any curve of which explains as much as something that happens once; "" where none
-    does.
+    """The channel of an adopted model any curve of which explains most of what something that happens once does: it
+    explains as much, or beside it the event explains no half of what it does alone; "" where none does.
 
     Parameters
     ----------
     state: without it; terms: at the residual's samples; theta: (P,).
     """
-    courses = [course for model in state.adopted for course in _followed(model, state.excitation)]
-    return _best(state, terms, theta, colours, courses, ahead=-SEPARATION)
+    courses = [course for model in state.adopted for course in followed(model, state.excitation)]
+    along = _Along.of(state, terms, theta, colours) if courses else None
+    if along is None:
+        return ""
+    alone = along.gain(along.waveform)
+    for name, values in courses:
+        gain, curve = along.best_curve(values)
+        if curve is None:
+            continue
+        beside = along.gain(np.column_stack([curve, along.waveform])) - gain
+        if gain > alone - SEPARATION or beside < HALF * alone:
+            return name
+    return ""
 
 
 def another_curve(state: State, model: Adopted, terms: Terms, theta: Array, colours: Colours) -> str:
@@ -44,66 +57,71 @@ def another_curve(state: State, model: Adopted, terms: Terms, theta: Array, colo
     of that one; "" where none does. Parameters as above."""
     x = state.excitation
     own = {name for name in channels_of(model, x) if not x.is_vector(name)}
-    if not own:
+    along = _Along.of(state, terms, theta, colours) if own else None
+    if along is None:
         return ""
-    others = [(n, v) for n, v in x.logged.items() if not x.is_vector(n)]
-    return _best(state, terms, theta, colours, [*others, *_followed(model, x)], ahead=SEPARATION, but=own)
+    gains = {n: along.best_curve(v)[0] for n, v in x.logged.items() if not x.is_vector(n) and n not in own}
+    best = max(gains, key=lambda name: gains[name], default="")
+    known = max([along.gain(along.waveform), *(along.best_curve(v)[0] for _, v in followed(model, x))])
+    return best if best and gains[best] > known + SEPARATION else ""
 
 
-def _best(
-    state: State,
-    terms: Terms,
-    theta: Array,
-    colours: Colours,
-    courses: list[tuple[str, Array]],
-    *,
-    ahead: float,
-    but: frozenset[str] | set[str] = frozenset(),
-) -> str:
-    """The channel, other than those of `but`, whose curve is ahead of terms by so much, and of those of `but`."""
-    residual = state.residual
-    if len(residual.affine) < LEAST_SAMPLES or not courses:
-        return ""
-    waveform, size, direction = np.linalg.svd(terms.contribution(theta, len(residual.noise)), full_matrices=False)
-    if size[0] ** 2 < ONE_WAVEFORM * np.sum(size**2) or size[0] == 0.0:
-        return ""
-    white = Whitened.of(residual, colours.across, colours.along, state.terms)
+@dataclass(frozen=True)
+class _Along:
+    """The direction at the sensors along which an effect acts, and what series (N, K) explain along it on blocks that
+    lie between others.
 
-    def gain(series: Array) -> float:
-        blocks = grams_in(white, _along(direction[0] * size[0], series), BLOCKS)
+    Attributes:
+        waveform: (N, 1) of the effect; direction: (3 S,) nT.
+    """
+
+    white: Whitened
+    waveform: Array
+    direction: Array
+
+    @classmethod
+    def of(cls, state: State, terms: Terms, theta: Array, colours: Colours) -> _Along | None:
+        """None of a survey that is too short, or where the outputs share no waveform."""
+        residual = state.residual
+        if len(residual.affine) < LEAST_SAMPLES:
+            return None
+        waveform, size, direction = np.linalg.svd(terms.contribution(theta, len(residual.noise)), full_matrices=False)
+        if size[0] ** 2 < ONE_WAVEFORM * np.sum(size**2) or size[0] == 0.0:
+            return None
+        white = Whitened.of(residual, colours.across, colours.along, state.terms)
+        return cls(white, waveform[:, :1], direction[0] * size[0])
+
+    def gain(self, series: Array) -> float:
+        """What series explain."""
+        blocks = grams_in(self.white, _series_along(self.direction, series), BLOCKS)
         given = np.arange(blocks.count) < blocks.count - series.shape[1]
-        return interleaved_gain(blocks, residual.freedom, given, np.ones(blocks.count, dtype=bool)).total
+        every = np.ones(blocks.count, dtype=bool)
+        return float(interleaved_gain(blocks, self.white.residual.freedom, given, every).total)
 
-    known, found = gain(waveform[:, :1]), {name: -np.inf for name, _ in courses}
-    for name, values in courses:
-        column = (values if values.ndim == 1 else values.mean(axis=1))[residual.samples]
-        if np.ptp(column) > 0:
-            found[name] = max([found[name], *(gain(hats(column, knots)) for knots in KNOTS)])
-    known = max([known, *(found[name] for name in but)])
-    best = max(found.keys() - but, key=lambda name: found[name], default="")
-    return best if best and found[best] > known + ahead else ""
-
-
-def hats(values: Array, knots: int) -> Array:
-    """(N, K - 1) what is 1 at one of K knots, evenly over the values (N,), and falls straight to 0 at the next ones;
-    that of the lowest knot is left out, for a constant is an offset."""
-    at = (values - values.min()) / np.ptp(values) * (knots - 1)
-    return np.column_stack([np.maximum(1.0 - np.abs(at - knot), 0.0) for knot in range(1, knots)])
+    def best_curve(self, values: Array) -> tuple[float, Array | None]:
+        """What the best curve of a channel (N,) or (N, S) of all samples explains, and its series; of a constant -inf
+        and None."""
+        column = (values if values.ndim == 1 else values.mean(axis=1))[self.white.residual.samples]
+        if np.ptp(column) == 0:
+            return -np.inf, None
+        curves = [along_a_curve(column, bends_of(column, pieces)) for pieces in PIECES]
+        every = [np.column_stack([c for _, c in curve]) for curve in curves]
+        return max(((self.gain(series), series) for series in every), key=lambda each: each[0])
 
 
-def _followed(model: Adopted, x: Excitation) -> Iterator[tuple[str, Array]]:
-    """The channels that a model follows, each with its course through the model's lag."""
-    for name in sorted(channels_of(model, x)):
-        if not x.is_vector(name):
-            lag = max(float(model.settings.get("lag_s", 0.0)), 0.0)
-            yield name, x.channel(name, lag, bool(model.settings.get("delayed", False)))
+def followed(model: Adopted, x: Excitation) -> list[tuple[str, Array]]:
+    """The channels with one value, or one for each sensor, that a model follows, each with its course through the
+    model's lag."""
+    lag, delayed = max(float(model.settings.get("lag_s", 0.0)), 0.0), bool(model.settings.get("delayed", False))
+    names = sorted(name for name in channels_of(model, x) if not x.is_vector(name))
+    return [(name, x.channel(name, lag, delayed)) for name in names]
 
 
-def _along(direction: Array, series: Array) -> Terms:
+def _series_along(direction: Array, series: Array) -> Terms:
     """One coefficient for each of the series (N, K), which add to the outputs along a direction (3 S,)."""
     count, outputs = series.shape[1], np.arange(len(direction))
     each = np.repeat(np.arange(count), len(outputs))
     return Terms(
-        tuple(f"knot {k}" for k in range(count)), ("",) * count, ("nT",) * count, series, each,
+        tuple(f"series {k}" for k in range(count)), ("",) * count, ("nT",) * count, series, each,
         np.tile(outputs, count), each, part_weight=np.tile(direction, count),
     )  # fmt: skip

@@ -85,7 +85,7 @@ def source_adopted(record: Record, state: State, component: Component, how: Fitt
         why_not = shared.objection or f"noise of the sensors alone explains it (p {shared.p:.2g})"
         raise DataError(f"no source that nobody logged can be taken off: {why_not}")
     told = f"p {shared.p:.2g}, held-out gain {shared.gain.total:.4g} (t {shared.gain.t:.2g})"
-    return ByHand(told, source.record, source.after, Step(state, (), source.evidence))
+    return ByHand(told, source.record, source.after, Step(state, (), source.evidence, like=source.like))
 
 
 def taken_out(record: Record, state: State, places: Sequence[int], how: Fitting) -> ByHand:

@@ -128,13 +128,18 @@ def put_back(residual: Residual, terms: Terms, theta: Array) -> Residual:
 
 
 def put_back_one(state: State, place: int) -> State:
-    """The state as it would be without one of the models, to first order: its part in the residual, the terms of the
+    """As `put_back_some`, of one."""
+    return put_back_some(state, [place])
+
+
+def put_back_some(state: State, places: Sequence[int]) -> State:
+    """The state as it would be without some of the models, to first order: their part in the residual, the terms of the
     others alone."""
     assert state.terms is not None
-    own = slices(state)[place]
-    mine = state.terms.only(range(own.start, own.stop))
-    rest = [i for i in range(state.terms.count) if not own.start <= i < own.stop]
-    residual = put_back(state.residual, mine, state.theta[place])
+    gone = {i for place in places for i in range(*slices(state)[place].indices(state.terms.count))}
+    rest = [i for i in range(state.terms.count) if i not in gone]
+    theta = np.concatenate(state.theta)[sorted(gone)]
+    residual = put_back(state.residual, state.terms.only(sorted(gone)), theta)
     return replace(state, residual=residual, terms=state.terms.only(rest) if rest else None)
 
 

@@ -24,6 +24,7 @@ class Step:
         refused: model -> why it was not kept after it had been fitted.
         among: the sensors looked at, where some that wander were left out; () where all were.
         channels: others that the data do not separate from the one that it follows.
+        like: the channel that the waveform of a source nobody logged is like; "" where there is none.
         screened: names of the models that were tried with every setting, those looked at closely among them.
     """
 
@@ -35,6 +36,7 @@ class Step:
     refused: Mapping[str, str] = field(default_factory=dict)
     among: tuple[str, ...] = ()
     channels: tuple[str, ...] = ()
+    like: str = ""
     screened: tuple[str, ...] = ()
 
 

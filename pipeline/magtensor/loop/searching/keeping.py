@@ -9,7 +9,7 @@ from magtensor.loop.fitting.log_noise import channels_of
 from magtensor.loop.fitting.model import Fitting, Record
 from magtensor.loop.fitting.trial import Trial, on_the_folds_of, trial
 from magtensor.loop.remainder.changing_matrix import channel_instead
-from magtensor.loop.remainder.curve_of_a_channel import another_curve, event_of_a_curve
+from magtensor.loop.remainder.curve_of_a_channel import event_of_a_curve
 from magtensor.loop.searching.adopting import adopt, narrowed, polished
 from magtensor.loop.searching.beginnings import at_its_limit, began_with_a_vector
 from magtensor.loop.searching.contribution import (
@@ -20,6 +20,7 @@ from magtensor.loop.searching.contribution import (
     share_of_the_field,
 )
 from magtensor.loop.searching.gates import Candidate
+from magtensor.loop.searching.likeness import event_along
 from magtensor.loop.searching.profiling import already
 from magtensor.loop.searching.rivals import hardly_begun
 
@@ -94,11 +95,11 @@ def why_not(before: Trial, after: Trial, chosen: Candidate, how: Fitting) -> str
         return "fitted together with the others, it leaves more than it takes away"
     theta = chosen.assessment.theta[-chosen.terms.count :]
     seen = chosen.before or before.state  # at the samples of its terms
-    if channel := another_curve(seen, chosen.model, chosen.terms, theta, chosen.assessment.colours):
-        return f"any curve of {channel} explains more"
     if happens_once(model):
+        if name := event_along(seen, chosen.terms, theta):
+            return f"it lies along the vectors of {name}, whose law may leave it"
         if channel := event_of_a_curve(seen, chosen.terms, theta, chosen.assessment.colours):
-            return f"a curve of {channel} explains as much: what is adopted may miss its law"
+            return f"a curve of {channel} explains most of it: what is adopted may miss its law"
         terms = chosen.terms.only(i for i, s in enumerate(chosen.terms.sensors) if s in acts_on)
         if channel := channel_instead(seen, terms, chosen.assessment.colours):
             return f"C of {', '.join(acts_on)} follows {channel}, which explains more than something that happens once"

@@ -9,7 +9,6 @@ stretches. Two sensors have one contrast: which of them was disturbed cannot be 
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -39,7 +38,13 @@ from magtensor.loop.fitting.log_noise import brought_in
 from magtensor.loop.fitting.model import Adopted, Fitting, Record, State
 from magtensor.loop.fitting.refit import joint_state
 from magtensor.loop.searching.gates import OF_THE_LAW, Candidate, explained_before, explained_by, gained_of_a_log
-from magtensor.loop.searching.likeness import effect_along, followed, of_an_unseen_path
+from magtensor.loop.searching.likeness import (
+    effect_along,
+    followed,
+    followed_by_a_curve,
+    held_out_losses,
+    of_an_unseen_path,
+)
 
 LEAST_SENSORS = 3  # from here on noise of single sensors does not imitate a factor
 QUIET = 5.0  # times the median square of a step: of a few dozen values none is as large by chance
@@ -87,6 +92,11 @@ class Sought:
     def significant(self) -> bool:
         """Whether it is there."""
         return self.p < ALPHA and not self.of_the_log
+
+    @property
+    def one_waveform(self) -> bool:
+        """Whether nothing stands against it but what it follows, or what may leave it."""
+        return not self.objection or bool(self.left_by) or self.objection.startswith(OF_A_CHANNEL)
 
 
 def sought(state: State, record: Record, *, may_follow: bool = False) -> Sought | None:
@@ -167,11 +177,17 @@ def _acts_once(values: Array) -> bool:
 
 @dataclass(frozen=True)
 class Source:
-    """An adopted source: the record with its waveform, the calibration with it, and the evidence."""
+    """An adopted source.
+
+    Attributes:
+        record: with its waveform; after: the calibration with it; evidence: for it.
+        like: the logged channel that its waveform is like, or any curve of which predicts it; "" where there is none.
+    """
 
     record: Record
     after: State
     evidence: Candidate
+    like: str
 
 
 def tried_source(
@@ -201,7 +217,8 @@ def tried_source(
     gain = found.gain
     folds, p = Blocks.equal(len(state.residual.affine)), found.p
     evidence = Assessment(estimate, folds, gain, gain, None, None, p, p, p, 0.0, state.colours, estimate.theta)
-    return found, Source(record, after, Candidate(model, 1, terms, evidence, p, p, p, ALPHA))
+    like = found.like[0] if found.like else followed_by_a_curve(found.time, found.values, record)
+    return found, Source(record, after, Candidate(model, 1, terms, evidence, p, p, p, ALPHA), like)
 
 
 def _own_noise(state: State) -> Array:
@@ -310,22 +327,12 @@ def _turning(record: Record, state: State) -> bool:
     n = len(series)
     laws = [made(state.excitation)[state.residual.samples] for made in (attitude_series, curve_series)]
     edges = np.linspace(0, n, FOLDS + 1).round().astype(int)
-    before = _held_out_losses(series, affine, edges)
+    before = held_out_losses(series, affine, edges)
     return any(
-        Gain(before, _held_out_losses(series, columns, edges), np.diff(edges).astype(float)).consistent
+        Gain(before, held_out_losses(series, columns, edges), np.diff(edges).astype(float)).consistent
         for columns in (np.column_stack([affine, *laws[:k]]) for k in (1, 2))
         if n >= 4 * columns.shape[1]
     )
-
-
-def _held_out_losses(series: Array, columns: Array, edges: Array) -> Array:
-    """(F,) squares of a series (n,) in folds that columns (n, K) predict from the others."""
-    losses = []
-    for a, b in itertools.pairwise(edges):
-        train = np.r_[0:a, b : len(series)]
-        theta = np.linalg.lstsq(columns[train], series[train], rcond=1e-9)[0]
-        losses.append(np.sum((series[a:b] - columns[a:b] @ theta) ** 2))
-    return np.array(losses)
 
 
 def shared_words(found: Sought, sensors: Sequence[str]) -> str:

@@ -2,16 +2,25 @@
 
 from __future__ import annotations
 
+import itertools
+from dataclasses import replace
+
 import numpy as np
 
 from magtensor.calibration.types import Array
-from magtensor.error_models.waveform import NAME
+from magtensor.error_models.curves import along_a_curve, bends_of
+from magtensor.error_models.terms import Terms
+from magtensor.error_models.waveform import NAME, free_directions
+from magtensor.loop.evidence.folds import FOLDS
+from magtensor.loop.fitting.log_noise import channels_of
 from magtensor.loop.fitting.model import Record, State
+from magtensor.loop.remainder.curve_of_a_channel import PIECES
 
 LIKE_A_CHANNEL = 0.7  # correlation from which a logged channel is the suspect and no hidden source
 MOST_LAG = 0.1  # of the survey, in which a channel is compared with the waveform
 COMPARED = 400  # points at which it is
 LIKE_AN_EFFECT = 0.9  # cosine; of two directions off the plane of four sensors one pair in a thousand is nearer
+ONE_SENSOR = 0.9  # of what something that happened once does
 ONE_DIRECTION = 0.9  # of an effect's power
 REMEMBERS = 0.3  # of its size, what other samples change of a regressor that remembers the field there
 
@@ -38,6 +47,33 @@ def followed(time: Array, values: Array, record: Record) -> tuple[str, float, in
                     if best is None or abs(c) > abs(best[3]) + 0.01:
                         best = (name, shift * step, power, c)
     return best if best is not None and abs(best[3]) > LIKE_A_CHANNEL else None
+
+
+def followed_by_a_curve(time: Array, values: Array, record: Record) -> str:
+    """The channel with one value, or one for each sensor, any curve of which predicts a waveform best in stretches that
+    it was not fitted to; "" where none predicts half of its square."""
+    edges = np.linspace(0, len(values), FOLDS + 1).round().astype(int)
+    whole = float(held_out_losses(values, np.ones((len(values), 1)), edges).sum())
+    shares = {}
+    for name, channel in record.logged.items():
+        if channel.ndim == 2 and channel.shape[1] == 3 and len(record.sensors) != 3:
+            continue
+        course = np.interp(time, record.time, channel if channel.ndim == 1 else channel.mean(axis=1))
+        curve = along_a_curve(course, bends_of(course, PIECES[-1]))
+        columns = np.column_stack([np.ones(len(course)), *(column for _, column in curve)])
+        shares[name] = 1.0 - float(held_out_losses(values, columns, edges).sum()) / whole
+    best = max(shares, key=lambda name: shares[name], default="")
+    return best if best and shares[best] > LIKE_A_CHANNEL**2 else ""
+
+
+def held_out_losses(series: Array, columns: Array, edges: Array) -> Array:
+    """(F,) squares of a series (n,) in folds that columns (n, K) predict from the others."""
+    losses = []
+    for a, b in itertools.pairwise(edges):
+        train = np.r_[0:a, b : len(series)]
+        theta = np.linalg.lstsq(columns[train], series[train], rcond=1e-9)[0]
+        losses.append(np.sum((series[a:b] - columns[a:b] @ theta) ** 2))
+    return np.array(losses)
 
 
 def _means(time: Array, values: Array, points: Array) -> Array:
@@ -71,6 +107,29 @@ def effect_along(state: State, basis: Array, direction: Array) -> str:
         if powers[-1] > ONE_DIRECTION * powers.sum() > 0 and abs(vectors[:, -1] @ direction) > LIKE_AN_EFFECT * size:
             return model.name
     return ""
+
+
+def event_along(state: State, terms: Terms, theta: Array) -> str:
+    """The adopted error model that follows a channel and whose own vector at the sensors is that of something that
+    happened once; "" where there is none. A law of a channel that no model has, a play or a delay that changes, leaves
+    that where it is furthest off. Not asked of what one sensor makes alone: the three numbers of two such vectors agree
+    by chance one time in ten.
+
+    Parameters
+    ----------
+    state: without it; terms: at the residual's samples; theta: (P,).
+    """
+    if state.residual.across is None:
+        return ""
+    basis = free_directions(np.eye(len(state.residual.noise)) - state.residual.projector)
+    moved = terms.contribution(theta, len(state.residual.noise)) / state.residual.noise
+    each = np.sum((moved - moved.mean(axis=0)) ** 2, axis=0).reshape(-1, 3).sum(axis=1)
+    if each.max() >= ONE_SENSOR * each.sum():  # or what is of the reference, and moves none
+        return ""
+    direction = np.linalg.svd((moved - moved.mean(axis=0)) @ basis, full_matrices=False)[2][0]
+    following = [i for i, a in enumerate(state.adopted) if channels_of(a, state.excitation)]
+    some = replace(state, adopted=tuple(state.adopted[i] for i in following))
+    return effect_along(replace(some, theta=tuple(state.theta[i] for i in following)), basis, direction)
 
 
 def of_an_unseen_path(state: State) -> list[int]:

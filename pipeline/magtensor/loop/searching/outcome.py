@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from magtensor.error_models.settings import Beginning, EventTimes, Forms, Frequencies, Range, profiled
+from magtensor.error_models.settings import Beginning, Bends, EventTimes, Forms, Frequencies, Range, profiled
 from magtensor.error_models.waveform import NAME
 from magtensor.loop.fitting.model import Adopted, Record
 from magtensor.loop.searching.contribution import happens_once
@@ -67,6 +67,7 @@ def _step_of(found: Search, model: Adopted) -> Step | None:
     grids = profiled(model.component)
     ranges = [name for name, grid in grids.items() if isinstance(grid, (Range, Frequencies))]
     free = {*ranges, *(name for name, grid in grids.items() if isinstance(grid, (Forms, Beginning)))}
+    free.update(*(grid.instead for grid in grids.values() if isinstance(grid, Bends)))
 
     def apart(adopted: Adopted) -> float:
         pairs = [(float(adopted.settings.get(name, 0.0)), float(model.settings.get(name, 0.0))) for name in ranges]
@@ -107,6 +108,7 @@ def _adopted(found: Search, index: int) -> dict[str, Any]:
         "evidence": {"held_out_rms_before_nT": before, "held_out_rms_after_nT": after, "z": z_of(p)},
         "indistinguishable_from": rivals,
         **({"channels_as_good": list(step.channels)} if step is not None and step.channels else {}),
+        **({"most_like_channel": step.like} if step is not None and step.like else {}),
     }
 
 
@@ -118,6 +120,8 @@ def _settings(model: Adopted) -> dict[str, Any]:
 
 
 def _plain(value: Any) -> Any:
+    if isinstance(value, tuple):
+        return [_plain(each) for each in value]
     return value.item() if isinstance(value, np.generic) else value
 
 

@@ -129,6 +129,12 @@ class Thinned:
         terms = terms_of(model, settings, self.every, failed)
         return None if terms is None else terms.at(self.residual.samples)
 
+    def of_model(self, model: Adopted) -> Terms:
+        """The regressors of a model with settings, at the samples."""
+        if model.component.pointwise:
+            return model.terms(self.own)
+        return model.terms(self.every).at(self.residual.samples)
+
 
 def thinned(state: State, most: int) -> tuple[Residual, Terms | None]:
     """At most so many samples of a residual, evenly chosen, and the adopted terms there."""

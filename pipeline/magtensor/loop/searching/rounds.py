@@ -10,7 +10,9 @@ from magtensor.error_models.excitation import Excitation
 from magtensor.error_models.needs import missing
 from magtensor.loop.fitting.model import CHANNEL, Fitting, Record, State, generic
 from magtensor.loop.fitting.trial import Trial, on_the_folds_of, per_sample, trial
+from magtensor.loop.remainder.curve_of_a_channel import another_curve
 from magtensor.loop.remainder.tones import channels_of_the_line, tones
+from magtensor.loop.searching.any_law import by_a_curve, by_any_law, by_any_law_of
 from magtensor.loop.searching.contribution import eliminate, tones_of, without_models
 from magtensor.loop.searching.course_of_time import beside_time, rivals_in_time
 from magtensor.loop.searching.exchange import looked_at_again, simpler
@@ -19,6 +21,7 @@ from magtensor.loop.searching.gates import Candidate
 from magtensor.loop.searching.keeping import ONE_OF_A_KIND, UNEARNED, Fitted, fitted, why_not
 from magtensor.loop.searching.larger_law import part_of_a_larger_law
 from magtensor.loop.searching.latent import NAME, Sought, Source, renewed, sought, tried_source
+from magtensor.loop.searching.likeness import followed_by_a_curve
 from magtensor.loop.searching.own_fit import at_their_own_fit
 from magtensor.loop.searching.profiling import repeatable
 from magtensor.loop.searching.rivals import containing, overlaps, part_of, part_of_a_drift, simplest
@@ -104,6 +107,11 @@ class Rounds:
             if adopted.standing is not None:
                 record, state = renewed(record, adopted.standing.state, how)
                 standing = replace(adopted.standing, state=state)
+                if by_a_curve(state.adopted[-1]):  # of more pieces, before anything is adopted for what it leaves
+                    standing, more = by_any_law(
+                        record, standing, how, [len(state.adopted) - 1], self.alpha, open_, self.fixed
+                    )
+                    state, steps = standing.state, [*steps, *more]
                 continue
             exchanged = None if asked else _exchanged(record, state, steps, how, self.fixed, open_)
             asked = True
@@ -115,7 +123,22 @@ class Rounds:
                 record, state = renewed(record, after.state, how)
                 standing = replace(after, state=state)
                 continue
-            shared, found = self.with_source(record, state, how, steps[-1])
+            places = range(self.fixed, len(state.adopted))
+            standing, more = by_any_law(record, standing, how, places, self.alpha, open_, self.fixed)
+            if more:
+                if self.say is not None:
+                    self.say("following any curve of a channel")
+                record, state = renewed(record, standing.state, how)
+                standing, steps = replace(standing, state=state), [*steps, *more]
+                continue
+            shared = sought(state, record)
+            kept = self.by_its_channel(record, standing, shared, how, open_)
+            if kept.standing is not None:
+                steps.append(kept.step(state, [kept.chosen] if kept.chosen else []))
+                record, state = renewed(record, kept.standing.state, how)
+                standing = replace(kept.standing, state=state)
+                continue
+            shared, found = self.with_source(record, state, how, steps[-1], shared)
             if found is None:
                 break
             record, state, steps[-1] = found
@@ -135,16 +158,23 @@ class Rounds:
         """Fit the candidates that pass, found among so many models, the best first, until one is kept; the first of
         them that fails on held-out blocks may be kept with another beside it."""
         refused: dict[str, str] = {}
-        while passing := [c for c in candidates if c.passes and c.model.name not in refused]:
+        asked: set[str] = set()  # channels whose curves have had their turn
+        left = list(candidates)
+
+        def refuse(name: str, why: str) -> None:
+            refused[name] = why
+            left[:] = [c for c in left if c.model.name != name]
+
+        while passing := [c for c in left if c.passes]:
             best = max(passing, key=lambda c: c.assessment.gain.total)
-            possible = [c for c in candidates if c.predicts and c.model.name not in refused]
+            possible = [c for c in left if c.predicts]
             best = containing(best, possible, before.state)
             chosen, rivals = simplest(best, possible, before.state)
             if name := part_of_a_drift(chosen, candidates, before.state):
-                refused[chosen.model.name] = f"{name}, which lasts, predicts as much"
+                refuse(chosen.model.name, f"{name}, which lasts, predicts as much")
                 continue
             if why := part_of_a_larger_law(chosen, before.state):
-                refused[chosen.model.name] = why
+                refuse(chosen.model.name, why)
                 continue
             chosen, channels = nearest(chosen, before.state, models)
             for frequency in tones_of(chosen.model):
@@ -152,7 +182,13 @@ class Rounds:
                     rivals = tuple(sorted({*rivals, CHANNEL}))
             time = beside_time(chosen, before.state)
             if time.refused:
-                refused[chosen.model.name] = time.refused
+                refuse(chosen.model.name, time.refused)
+                continue
+            if channel := _outdone(chosen, before.state):
+                refuse(chosen.model.name, f"any curve of {channel} explains more")
+                if channel not in asked:
+                    asked.add(channel)
+                    left += by_any_law_of(channel, before.state, self.open_models(before.state), self.alpha)
                 continue
             if not time.seen:
                 rivals = tuple(sorted({*rivals, *rivals_in_time(chosen, possible, before.state)}))
@@ -164,14 +200,14 @@ class Rounds:
                 if two := self.with_another(record, before, chosen, tried, how):
                     return replace(two, rivals=rivals, channels=channels, refused=refused)
             if tried.after is None or tried.why:
-                refused[chosen.model.name] = tried.why
-                for c in candidates if tried.why != UNEARNED else ():
-                    if not c.passes or c.model.name in refused:
+                refuse(chosen.model.name, tried.why)
+                for c in list(left) if tried.why != UNEARNED else ():
+                    if not c.passes:
                         continue
                     if part_of(c, chosen, before.state):
-                        refused[c.model.name] = f"a small part of what {chosen.model.name} explains, which failed"
+                        refuse(c.model.name, f"a small part of what {chosen.model.name} explains, which failed")
                     elif tried.why == ONE_OF_A_KIND and overlaps(c, chosen, before.state):
-                        refused[c.model.name] = f"most of it is what the law of {chosen.model.name} leaves"
+                        refuse(c.model.name, f"most of it is what the law of {chosen.model.name} leaves")
                 continue
             return Kept(tried.after, chosen, rivals, channels, dropped, refused)
         return Kept(None, refused=refused)
@@ -211,13 +247,22 @@ class Rounds:
             return None
         return Kept(both, chosen, then=(second.step(state, candidates),))
 
+    def by_its_channel(self, record: Record, standing: Trial, shared: Sought | None, how: Fitting, models: int) -> Kept:
+        """What a waveform that the sensors share comes from, where a curve of a logged channel predicts it: then the
+        source is logged, and only its law had no name."""
+        if shared is None or not shared.significant or not shared.one_waveform:
+            return Kept(None)
+        channel = followed_by_a_curve(shared.time, shared.values, record)
+        state = standing.state
+        curves = by_any_law_of(channel, state, self.open_models(state), self.alpha) if channel else []
+        return self.first_kept(record, standing, curves, how, models, with_others=False)
+
     def with_source(
-        self, record: Record, state: State, how: Fitting, step: Step
+        self, record: Record, state: State, how: Fitting, step: Step, shared: Sought | None
     ) -> tuple[Sought | None, tuple[Record, State, Step] | None]:
         """The waveform that the sensors share, and the fit with a source nobody logged that makes it; None where none
         is adopted."""
         hidden = next((m for m in self.models if m.name == NAME), None)
-        shared = sought(state, record)
         if shared is None or hidden is None or NAME in {a.name for a in state.adopted}:
             return shared, None
         shared, source = tried_source(hidden, record, state, shared, how, self.alpha)
@@ -234,7 +279,14 @@ class Rounds:
         if dropped and NAME not in dropped:  # what had taken a part of the source for its own
             record, state = renewed(record, last, how)
         gone = (*([instead] if instead else []), *(() if NAME in dropped else dropped))
-        return None, (record, state, replace(step, adopted=source.evidence, dropped=gone))
+        return None, (record, state, replace(step, adopted=source.evidence, dropped=gone, like=source.like))
+
+
+def _outdone(chosen: Candidate, state: State) -> str:
+    """The channel any curve of which explains more than a candidate that follows another; "" where there is none."""
+    theta = chosen.assessment.theta[-chosen.terms.count :]
+    seen = chosen.before or state  # at the samples of its terms
+    return another_curve(seen, chosen.model, chosen.terms, theta, chosen.assessment.colours)
 
 
 def _exchanged(
@@ -300,9 +352,12 @@ class Kept:
     then: tuple[Step, ...] = ()
 
     def step(self, before: State, candidates: Sequence[Candidate]) -> Step:
-        """The round's story; what follows another channel than its candidate did stands in its place."""
+        """The round's story; what follows another channel than its candidate did stands in its place, and a curve that
+        was none of the candidates behind them."""
         kept = self.chosen
         told = tuple(kept if kept and c.model.name == kept.model.name else c for c in candidates)
+        if kept and all(c is not kept for c in told):
+            told = (*told, kept)
         return Step(before, told, kept, self.rivals, self.dropped, self.refused, channels=self.channels)
 
 

@@ -87,7 +87,7 @@ def search(
         state, dropped = borne_out(record, state, how, len(declared))
         candidates = rounds.candidates(state := with_lines(state, record, lines), record, how)
         step = Step(state, tuple(candidates), None, refused={name: why}, dropped=dropped)
-        source = None if name == NAME else rounds.with_source(record, state, how, step)[1]
+        source = None if name == NAME else rounds.with_source(record, state, how, step, sought(state, record))[1]
         if source is not None:  # which the model that is gone was a part of
             record, state, step = source
         steps, last = (*steps, step), _settled(record, state, how)

@@ -14,7 +14,7 @@ import numpy as np
 
 from magtensor.calibration.types import Array
 from magtensor.error_models.settings import profiled
-from magtensor.error_models.terms import Terms, joined
+from magtensor.error_models.terms import joined
 from magtensor.loop.evidence.assessment import WHITE, assess, colours_of, estimated, likeliest
 from magtensor.loop.evidence.golden import golden
 from magtensor.loop.evidence.grams import Whitened
@@ -78,7 +78,7 @@ def _as_two(state: State, place: int, alpha: float, models: int) -> Candidate | 
     if not pairs:
         return None
     few, (back, given) = Thinned.of(state, SCREENING_SAMPLES), thinned(put_back_one(state, place), SCREENING_SAMPLES)
-    terms = {value: _at(few, settings[value]) for value in values}
+    terms = {value: few.of_model(settings[value]) for value in values}
     both = [joined([terms[a], terms[b]]) for a, b in pairs]
     starts: dict[tuple[float, float], None] = {}
     for beside, colours in ((few.white, WHITE), (few.coloured, colours_of(few.residual))):
@@ -96,18 +96,13 @@ def _with(model: Adopted, name: str, value: float) -> Adopted:
     return replace(model, settings={**model.settings, **at_rest, name: value})
 
 
-def _at(few: Thinned, model: Adopted) -> Terms:
-    """Its regressors at some of the samples."""
-    return model.terms(few.own) if model.component.pointwise else model.terms(few.every).at(few.residual.samples)
-
-
 def _assessed(state: State, place: int, name: str, pair: tuple[float, float], alpha: float, tried: float) -> Candidate:
     """The two, their settings refined, and what they explain beside what is adopted."""
     model = state.adopted[place]
     grid = sorted(profiled(model.component)[name].values(state.excitation))
     few = Thinned.of(state, REFINING_SAMPLES)
     residual, given = thinned(put_back_one(state, place), REFINING_SAMPLES)
-    terms = [_at(few, _with(model, name, value)) for value in pair]
+    terms = [few.of_model(_with(model, name, value)) for value in pair]
     together = joined([*terms] if given is None else [given, *terms])
     score = Scorer(residual, given, likeliest(residual, together, [colours_of(residual), WHITE]).colours)
     here = list(pair)
@@ -117,11 +112,11 @@ def _assessed(state: State, place: int, name: str, pair: tuple[float, float], al
 
         def gain(value: float, which: int = which) -> float:
             moved = [*terms]
-            moved[which] = _at(few, _with(model, name, value))
+            moved[which] = few.of_model(_with(model, name, value))
             return score(joined(moved))
 
         here[which] = golden(gain, low, high, here[which])
-        terms[which] = _at(few, _with(model, name, here[which]))
+        terms[which] = few.of_model(_with(model, name, here[which]))
     one, other = (_with(model, name, value) for value in here)
     both = joined([m.terms(state.excitation).at(state.residual.samples) for m in (one, other)])
     now = Whitened.of(state.residual, state.colours.across, state.colours.along, state.terms)

@@ -1,0 +1,185 @@
+"""A law of a logged channel that is no power of it: found as straight lines that bend at values of the channel."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from loop_cases import synthetic
+from numpy.typing import NDArray
+
+from magtensor.components import Component
+from magtensor.error_models.curves import LEAST_AT_A_BEND, along_a_curve, bends_of
+from magtensor.loop.fitting.log_noise import brought_in
+from magtensor.loop.fitting.model import Adopted, Fitting, Record
+from magtensor.loop.fitting.refit import joint_state
+from magtensor.loop.fitting.trial import trial
+from magtensor.loop.searching.any_law import by_any_law, by_any_law_of
+from magtensor.loop.searching.found import Search
+from magtensor.loop.searching.gates import ALPHA
+from magtensor.loop.searching.outcome import described
+from magtensor.loop.searching.search import search
+from magtensor.registry import Registry
+
+Array = NDArray[np.float64]
+SAMPLES = 1500
+MODELS = ("channel_response", "latent_source", "offset_while", "offset_step", "offset_drift")
+
+
+def component(name: str) -> Component:
+    return Registry.load().find("error_model", name)
+
+
+def course(seed: int, remembers_s: float = 30.0) -> Array:
+    """A channel that wanders about 0 with an rms of 1 (first-order autoregression)."""
+    rng = np.random.default_rng(seed)
+    kept = np.exp(-1.0 / remembers_s)
+    out = np.empty(SAMPLES)
+    out[0] = rng.standard_normal()
+    for i, step in enumerate(rng.standard_normal(SAMPLES - 1)):
+        out[i + 1] = kept * out[i] + np.sqrt(1.0 - kept**2) * step
+    return out
+
+
+def logged(seed: int, values: Array, added: Array, **others: Array) -> Record:
+    """A survey with a channel `valve` and others, in which a series (N,) is added to each output in its proportion."""
+    share = np.random.default_rng(seed + 100).uniform(-2.0, 2.0, (4, 3))
+    channels = {"valve": values, **others}
+    record = synthetic(seed, SAMPLES, added=added[:, None, None] * share)
+    return replace(record, logged=channels, units=dict.fromkeys(channels, "1"), origins=dict.fromkeys(channels, 0.0))
+
+
+def found(record: Record, *names: str) -> Search:
+    return search(record, [component(name) for name in names or MODELS], Fitting())
+
+
+LAWS: dict[str, Callable[[Array], Array]] = {
+    "dead zone": lambda v: np.sign(v) * np.maximum(np.abs(v) - 0.7, 0.0),
+    "saturation": lambda v: np.tanh(v / 0.6),
+    "root": lambda v: np.sign(v) * np.sqrt(np.abs(v)),
+    "one way": lambda v: np.maximum(v, 0.0),
+    "without sign": np.abs,
+    "threshold": lambda v: 1.0 * (v > 0.4),
+}
+LONG = ("dead zone", "saturation", "root", "one way", "without sign")
+
+
+@pytest.mark.parametrize("law", [pytest.param(law, marks=pytest.mark.long) if law in LONG else law for law in LAWS])
+def test_a_law_that_is_no_power_is_found_and_nothing_beside_it(law: str) -> None:
+    """Of the channel that it follows, and no source that nobody logged; what is left is noise."""
+    values = course(3)
+    record = logged(5, values, 3.0 * LAWS[law](values), rain=course(4))
+    last = found(record).last
+    assert [(a.name, a.settings["channel"]) for a in last.adopted] == [("channel_response", "valve")]
+    assert last.adopted[0].settings["bends"]
+    assert last.residual.square() < 1.1
+
+
+def test_a_dead_zone_ends_where_it_does() -> None:
+    """A bend at each of its edges."""
+    values = course(6)
+    last = found(logged(7, values, 4.0 * LAWS["dead zone"](values)), "channel_response").last
+    bends = np.array(last.adopted[0].settings["bends"])
+    assert len(bends) <= 4 and all(np.abs(bends - edge).min() < 0.1 for edge in (-0.7, 0.7))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_what_is_in_proportion_has_no_bends(seed: int) -> None:
+    """Whatever its size beside the noise."""
+    values = course(20 + seed)
+    record = logged(30 + seed, values, [0.3, 1.0, 5.0, 30.0][seed] * values)
+    state = joint_state(record, [Adopted(component("channel_response"), as_found(times_field=False))], Fitting())
+    standing = trial(record, state, Fitting())
+    after, steps = by_any_law(record, standing, Fitting(), [0], ALPHA, 30)
+    assert after is standing and steps == []
+
+
+def test_noise_of_a_log_is_no_law() -> None:
+    """A channel that switches, and is logged with noise: a curve that is flat at both levels would be without it."""
+    rng = np.random.default_rng(60)
+    switched = np.repeat(rng.permutation(np.arange(SAMPLES // 20) % 2), 20).astype(float)
+    record = logged(61, switched + 0.01 * rng.standard_normal(SAMPLES), 60.0 * switched)
+    state = joint_state(record, [Adopted(component("channel_response"), as_found(times_field=False))], Fitting())
+    standing = trial(record, state, Fitting())
+    assert brought_in(state) > 100.0  # enough to be found
+    after, steps = by_any_law(record, standing, Fitting(), [0], ALPHA, 30)
+    assert after is standing and steps == []
+
+
+def test_a_curve_gets_the_bends_that_it_lacks() -> None:
+    """One edge of a dead zone is known, and a bend beyond it that nothing asks for; the other edge is found."""
+    values = course(6)
+    record = logged(7, values, 4.0 * LAWS["dead zone"](values))
+    model = Adopted(component("channel_response"), as_found(times_field=False, bends=(0.7, 1.0)))
+    standing = trial(record, joint_state(record, [model], Fitting()), Fitting())
+    after, steps = by_any_law(record, standing, Fitting(), [0], ALPHA, 30)
+    bends = after.state.adopted[0].settings["bends"]
+    assert steps and {0.7, 1.0} < set(bends) and min(abs(bend + 0.7) for bend in bends) < 0.1
+    assert after.state.residual.square() < 1.1
+
+
+def as_found(**settings: object) -> dict[str, object]:
+    """Settings of a response as the search gives them, all named."""
+    parameters = component("channel_response").parameters
+    return {name: p.default for name, p in parameters.items()} | {"channel": "valve"} | settings
+
+
+def test_a_scale_factor_follows_a_law_too() -> None:
+    """A saturation that acts on the outputs themselves."""
+    values = course(8)
+    record = synthetic(9, SAMPLES)
+    factor = 1.0 + 2e-4 * LAWS["saturation"](values)
+    record = replace(record, raw=record.raw * factor[:, None, None], logged={"valve": values}, units={"valve": "1"})
+    record = replace(record, origins={"valve": np.zeros(())})
+    state = joint_state(record, [Adopted(component("channel_response"), as_found(times_field=True))], Fitting())
+    standing = trial(record, state, Fitting())
+    after, steps = by_any_law(record, standing, Fitting(), [0], ALPHA, 30)
+    assert len(steps) >= 1 and after.state.adopted[0].settings["times_field"]
+    assert after.error is not None and standing.error is not None
+    assert max(after.error[s] / standing.error[s] for s in record.sensors) < 0.7
+
+
+def test_a_channel_that_explains_nothing_has_no_law() -> None:
+    """Noise beside a channel: no curve of it passes the gates."""
+    for seed in range(3):
+        record = logged(40 + seed, course(50 + seed), np.zeros(SAMPLES))
+        state = joint_state(record, [], Fitting())
+        assert by_any_law_of("valve", state, [component("channel_response")], ALPHA) == []
+
+
+def test_bends_lie_where_the_survey_was_twice() -> None:
+    """Where a channel was once only nothing tells its law from what happened then."""
+    time = np.linspace(0.0, 1.0, 1000)
+    once = np.where(time < 0.1, 5.0 + 10.0 * time, np.sin(60.0 * time))
+    bends = bends_of(once, 16)
+    assert bends and max(bends) < 1.5  # beyond it is the first tenth, which no other saw
+    assert all(bends_of(time, pieces) == () for pieces in (4, 16, 48))  # each value once
+    assert bends_of(np.repeat([0.0, 1.0], 500), 8) == () and bends_of(np.ones(100), 8) == ()
+    many = np.sin(60.0 * time)
+    assert len(bends_of(many, 8)) == 7 and bends_of(many[:: int(2000 / LEAST_AT_A_BEND)], 8) == ()  # too few samples
+
+
+def test_lines_that_bend_make_any_line_between_the_bends() -> None:
+    """And go on straight beyond the outer ones."""
+    values = np.random.default_rng(1).uniform(-3.0, 5.0, 400)
+    bends = (-1.0, 0.5, 4.0)
+    columns = np.column_stack([np.ones(400), *(column for _, column in along_a_curve(values, bends))])
+    wanted = np.interp(values, [-3.0, -1.0, 0.5, 4.0, 5.0], [2.0, -1.0, 3.0, 3.0, 0.0])
+    left = wanted - columns @ np.linalg.lstsq(columns, wanted, rcond=None)[0]
+    assert np.abs(left).max() < 1e-9
+
+
+@pytest.mark.long
+def test_a_source_that_a_channel_is_like_names_it() -> None:
+    """A play that follows a channel: no curve of it, so a source nobody logged; the verdict says what it is like."""
+    values = course(11, remembers_s=15.0)
+    behind = np.empty(SAMPLES)
+    behind[0] = values[0]
+    for i in range(1, SAMPLES):
+        behind[i] = min(max(behind[i - 1], values[i] - 1.0), values[i] + 1.0)
+    record = logged(12, values, 3.0 * behind)
+    last = found(record)
+    told = described(last, last.record, 0)["adopted"]
+    assert [one["error_model"] for one in told] == ["latent_source"] and told[0]["most_like_channel"] == "valve"
