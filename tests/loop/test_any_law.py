@@ -183,3 +183,13 @@ def test_a_source_that_a_channel_is_like_names_it() -> None:
     last = found(record)
     told = described(last, last.record, 0)["adopted"]
     assert [one["error_model"] for one in told] == ["latent_source"] and told[0]["most_like_channel"] == "valve"
+
+
+def test_what_a_recipe_leaves_open_of_a_declared_model_stays_so() -> None:
+    """A curve that is declared by its channel and bends alone, and an effect that is found beside it."""
+    values, rain = course(6), course(4)
+    record = logged(7, values, 4.0 * LAWS["dead zone"](values) + 2.0 * rain, rain=rain)
+    declared = Adopted(component("channel_response"), {"channel": "valve", "bends": (-0.7, 0.7)})
+    last = search(record, [component("channel_response")], Fitting(), declared=[declared]).last
+    assert dict(last.adopted[0].settings) == dict(declared.settings)
+    assert [a.settings["channel"] for a in last.adopted] == ["valve", "rain"] and last.residual.square() < 1.1

@@ -167,7 +167,7 @@ def _at_rest(record: Record, state: State, how: Fitting) -> State:
         moved = False
         for number, model in enumerate(state.adopted):
             for name, grid in profiled(model.component).items():
-                if not isinstance(grid, (Range, Frequencies)) or not state.adopted[number].settings[name]:
+                if not isinstance(grid, (Range, Frequencies)) or not state.adopted[number].settings.get(name):
                     continue
                 here = float(state.adopted[number].settings[name])
                 whole = abs(here) if isinstance(grid, Range) else 1.0 / state.excitation.duration
@@ -193,7 +193,7 @@ def _without_lags(record: Record, state: State, how: Fitting) -> State:
         gain = _Beside.of(state, number)
         best = dict(model.settings)
         for name, grid in profiled(model.component).items():
-            if not of_ratios(grid) or grid.low > 0 or not best[name]:
+            if not of_ratios(grid) or grid.low > 0 or not best.get(name):
                 continue
             none = {**best, name: 0.0, **_of_the_lag(model, name)}
             if gain(none) > gain(best) - SEPARATION / 2.0:
@@ -214,10 +214,11 @@ def _in_their_forms(record: Record, state: State, how: Fitting) -> State:
     """Every model in the forms that the data separate from others, with the settings on a range that suit these."""
     for number, model in enumerate(state.adopted):
         grids = profiled(model.component)
-        forms = {name: grid for name, grid in grids.items() if isinstance(grid, Forms)}
+        # of a declared model those that the recipe leaves open stay as they are
+        forms = {name: grid for name, grid in grids.items() if isinstance(grid, Forms) and name in model.settings}
         if not forms:
             continue
-        ranges = {name: grid for name, grid in grids.items() if isinstance(grid, Range)}
+        ranges = {name: grid for name, grid in grids.items() if isinstance(grid, Range) and name in model.settings}
         gain = _Beside.of(state, number)
         best = dict(model.settings)
         for name, grid in forms.items():

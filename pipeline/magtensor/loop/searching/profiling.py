@@ -74,7 +74,7 @@ def already(adopted: Iterable[Adopted], model: Component, settings: Mapping[str,
     same = channels or set(grids) - ranges - begun
     return any(
         all(one.settings.get(n) == settings.get(n) for n in same)
-        and not any(_apart(one.settings[n], settings[n]) for n in ranges)
+        and not any(_apart(one.settings.get(n, model.parameters[n].default), settings[n]) for n in ranges)
         for one in adopted
         if one.name == model.name
     )
