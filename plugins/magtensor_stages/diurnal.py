@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
+from magtensor.between_readings import Course, followed_best
 from magtensor.components import stage
 from magtensor.errors import DataError
 from magtensor.survey import reference
@@ -26,8 +27,12 @@ def detrend_diurnal(
     survey: Survey,
     *,
     interpolation: Annotated[
-        Literal["pchip", "linear"], Field(description="monotone cubic, or straight lines; neither overshoots")
-    ] = "pchip",
+        Literal["auto"] | Course,
+        Field(
+            description="between two readings: monotone cubic or straight lines, which never overshoot, a cubic "
+            "spline, or auto: the spline where it predicts readings left out better than the monotone cubic"
+        ),
+    ] = "auto",
     latency_s: Annotated[
         float, Field(description="the reference's stamps are late by this: stamped t, measured at t - latency_s")
     ] = 0.0,
@@ -71,6 +76,7 @@ def detrend_diurnal(
         time, values = time[~bad], values[~bad]
     origin = str(record.attrs.get("origin", "measured"))
     constant = origin == "constant"
+    how: Course = "linear"
     if constant:
         found = reference.Sampled(np.full(len(at), values[0]), np.ones(len(at), bool), np.ones(len(at)))
     else:
@@ -81,7 +87,8 @@ def detrend_diurnal(
             if len(time) > 1
             else 1.0
         )
-        found = reference.sample(at, time, values, smooth=interpolation == "pchip", max_gap_s=gap)
+        how = followed_best(time, values) if interpolation == "auto" else interpolation
+        found = reference.sample(at, time, values, how=how, max_gap_s=gap)
         if not found.covered.all():
             _refuse_or_tell(at, found.covered, time, gap, uncovered, where)
     field = found.values
@@ -91,7 +98,7 @@ def detrend_diurnal(
     else:
         value = float(base)
     facts = {"units": "nT", "origin": origin}
-    made: dict[str, Any] = {"interpolation": interpolation, "latency_s": latency_s, "base_nT": value}
+    made: dict[str, Any] = {"interpolation": how, "latency_s": latency_s, "base_nT": value}
     if despike is not None:
         made["despike"] = despike
     variables: dict[str, Any] = {

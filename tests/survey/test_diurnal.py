@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from survey_cases import START, array_variables
 
+from magtensor.between_readings import Course
 from magtensor.errors import DataError
 from magtensor.survey.model import Survey
 from magtensor.survey.reference import noise, sample, spikes
@@ -33,16 +34,16 @@ PICOTESLAS = st.integers(-(10**8), 10**8)  # no magnetometer tells less, and the
 RECORD = arrays(np.float64, 12, elements=PICOTESLAS.map(lambda count: count * 1e-3))
 
 
-@given(arrays(np.float64, 12, elements=st.floats(0.01, 3)), RECORD, st.booleans())
-def test_no_overshoot_and_exact_at_the_samples(steps: np.ndarray, record: np.ndarray, smooth: bool) -> None:
+@given(arrays(np.float64, 12, elements=st.floats(0.01, 3)), RECORD, st.sampled_from(["pchip", "linear"]))
+def test_no_overshoot_and_exact_at_the_samples(steps: np.ndarray, record: np.ndarray, how: Course) -> None:
     time = np.cumsum(steps)
     at = np.linspace(time[0], time[-1], 300)
-    found = sample(at, time, record, smooth=smooth, max_gap_s=100.0)
+    found = sample(at, time, record, how=how, max_gap_s=100.0)
     right = np.clip(np.searchsorted(time, at, side="right"), 1, len(time) - 1)
     slack = 1e-12 * np.abs(record).max()
     assert (found.values >= np.minimum(record[right - 1], record[right]) - slack).all()
     assert (found.values <= np.maximum(record[right - 1], record[right]) + slack).all()
-    np.testing.assert_array_equal(sample(time, time, record, smooth=smooth, max_gap_s=100.0).values, record)
+    np.testing.assert_array_equal(sample(time, time, record, how=how, max_gap_s=100.0).values, record)
     assert found.covered.all()
     assert (found.weight_norm <= 1 + 1e-12).all()
     assert (found.weight_norm >= np.sqrt(0.5) - 1e-12).all()
@@ -60,15 +61,24 @@ def test_a_slow_variation_is_followed() -> None:
     assert given["total_field"][2]["base_nT"] == pytest.approx(values(given, "total_field").mean())
 
 
-def test_pchip_follows_better_than_lines() -> None:
+def test_each_course_follows_a_sine_better_than_the_one_before() -> None:
     time = np.arange(-3.0, 45.0, 3.0)
     survey = survey_with(time, 48_000 + 20 * np.sin(time / 8))
     true = 48_000 + 20 * np.sin(np.arange(400) / 80)
     rms = [
         np.sqrt(np.mean((values(detrend_diurnal(survey, interpolation=how), "total_field") - true) ** 2))
-        for how in ("pchip", "linear")
+        for how in ("linear", "pchip", "spline")
     ]
-    assert rms[0] < 0.6 * rms[1]
+    assert rms[1] < 0.6 * rms[0] and rms[2] < 0.6 * rms[1]
+
+
+def test_the_course_in_use_is_told() -> None:
+    time = np.arange(-60.0, 100.0, 2.0)
+    smooth = survey_with(time, 48_000 + 20 * np.sin(time / 3))
+    rough = survey_with(time, 48_000 + np.random.default_rng(1).standard_normal(len(time)))
+    assert detrend_diurnal(smooth)["total_field"][2]["interpolation"] == "spline"
+    assert detrend_diurnal(rough)["total_field"][2]["interpolation"] == "pchip"
+    assert detrend_diurnal(smooth, interpolation="linear")["total_field"][2]["interpolation"] == "linear"
 
 
 @pytest.mark.parametrize(
@@ -109,7 +119,7 @@ def test_the_reference_goes_on_for_a_step(at: float) -> None:
     time = np.arange(0.0, 61.0, 5.0)
     rng = np.random.default_rng(3)
     noises = 0.02 * rng.standard_normal((400, len(time)))
-    found = [sample(np.array([at]), time, 0.15 * time + each, smooth=True, max_gap_s=25.0) for each in noises]
+    found = [sample(np.array([at]), time, 0.15 * time + each, how="pchip", max_gap_s=25.0) for each in noises]
     wrong = np.array([f.values[0] for f in found]) - 0.15 * at
     assert found[0].covered.all()
     assert abs(wrong.mean()) < 0.02 / 5  # of 400 draws
@@ -117,7 +127,7 @@ def test_the_reference_goes_on_for_a_step(at: float) -> None:
 
 
 def test_two_readings_make_a_line() -> None:
-    found = sample(np.array([-0.5, 0.5, 1.5]), np.array([0.0, 1.0]), np.array([10.0, 12.0]), smooth=True, max_gap_s=5.0)
+    found = sample(np.array([-0.5, 0.5, 1.5]), np.array([0.0, 1.0]), np.array([10.0, 12.0]), how="pchip", max_gap_s=5.0)
     np.testing.assert_allclose(found.values, [9.0, 11.0, 13.0])
 
 

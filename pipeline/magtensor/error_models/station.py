@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from magtensor.between_readings import Course, course
 from magtensor.calibration.types import Array
-
-if TYPE_CHECKING:
-    from scipy.interpolate import PchipInterpolator
 
 
 @dataclass(frozen=True)
@@ -21,25 +19,20 @@ class Station:
     Attributes:
         time: (M,) s on the survey's clock, increasing.
         field: (M,) nT, without the station's own noise as far as known.
-        smooth: read between its readings by a monotone cubic (PCHIP), as the total field was; else by straight lines.
+        how: what goes on between its readings, as the total field was read.
     """
 
     time: Array
     field: Array
-    smooth: bool = False
+    how: Course = "linear"
 
     def at(self, time: Array) -> Array:
         """The field (N,) nT at times (N,) s; held beyond the ends."""
-        if self._cubic is None:
-            return np.interp(time, self.time, self.field)
-        out: Array = self._cubic(np.clip(time, self.time[0], self.time[-1]))
-        return out
+        return self._course(np.clip(time, self.time[0], self.time[-1]))
 
     @cached_property
-    def _cubic(self) -> PchipInterpolator | None:
-        from scipy.interpolate import PchipInterpolator
-
-        return PchipInterpolator(self.time, self.field) if self.smooth and len(self.time) > 2 else None
+    def _course(self) -> Callable[[Array], Array]:
+        return course(self.time, self.field, self.how)
 
     @property
     def step_s(self) -> float:

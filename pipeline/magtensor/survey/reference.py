@@ -1,4 +1,4 @@
-"""The scalar reference at the array's times: interpolation that does not overshoot, gaps, spikes, uncertainty."""
+"""The scalar reference at the array's times: gaps, ends, spikes, uncertainty."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from magtensor.between_readings import Course, course, noise_gain
 from magtensor.survey.recorded_numbers import resolution
 
 Floats = NDArray[np.float64]
@@ -34,8 +35,8 @@ class Sampled:
     weight_norm: Floats
 
 
-def sample(at: Floats, time: Floats, values: Floats, *, smooth: bool, max_gap_s: float) -> Sampled:
-    """A record at other times, never above or below the two samples between which a time lies.
+def sample(at: Floats, time: Floats, values: Floats, *, how: Course, max_gap_s: float) -> Sampled:
+    """A record at other times, but for a spline never above or below the two samples between which a time lies.
 
     Within one median step of an end it goes on along the line through its last samples: where the field moves fast and
     the readings are far apart, the last one held would be wrong by what it moves in a step.
@@ -44,7 +45,7 @@ def sample(at: Floats, time: Floats, values: Floats, *, smooth: bool, max_gap_s:
         at: (M,) s.
         time: (N,) s, strictly increasing, N >= 1.
         values: (N,) finite.
-        smooth: monotone cubic (Fritsch and Carlson 1980, as PCHIP) instead of straight lines.
+        how: what goes on between its samples.
         max_gap_s: a longer step of the record is a gap, and so is everything beyond its ends by more than one
             median step.
     """
@@ -59,16 +60,13 @@ def sample(at: Floats, time: Floats, values: Floats, *, smooth: bool, max_gap_s:
     weight = (inside - time[right - 1]) / step
     on_sample = (weight == 0.0) | (weight == 1.0)
     covered = (np.abs(at - inside) <= edge) & ((step <= max_gap_s) | on_sample)
-    if smooth and len(time) > 2:
-        from scipy.interpolate import PchipInterpolator
-
-        found = PchipInterpolator(time, values)(inside)
-        low, high = np.minimum(values[right - 1], values[right]), np.maximum(values[right - 1], values[right])
-        found = np.clip(found, low, high)  # the last bit of rounding may overshoot
-    else:
-        found = values[right - 1] * (1.0 - weight) + values[right] * weight
+    found = course(time, values, how)(inside)
+    if how != "spline":  # the last bit of rounding may overshoot
+        found = np.clip(
+            found, np.minimum(values[right - 1], values[right]), np.maximum(values[right - 1], values[right])
+        )
     found = np.where(weight == 1.0, values[right], np.where(weight == 0.0, values[right - 1], found))
-    norm = np.hypot(1.0 - weight, weight)
+    norm = noise_gain(how, weight)
     for out, end in ((at < time[0], slice(None, ENDS)), (at > time[-1], slice(-ENDS, None))):
         beyond, own = (at - inside)[out], time[end] - time[end].mean()
         slope = own / np.sum(own**2)  # as a sum of the samples: a line of least squares

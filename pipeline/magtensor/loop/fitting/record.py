@@ -7,6 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from magtensor.between_readings import COURSES
 from magtensor.calibration.types import Array
 from magtensor.error_models.quiet import quieted
 from magtensor.error_models.station import Station
@@ -140,7 +141,8 @@ def _station(survey: Survey) -> Station | None:
         good = ~spikes(values, float(made["despike"]))
         at, values = at[good], values[good]
     at = at - float(made.get("latency_s", 0.0))
-    return Station(at, quieted(values, CLEARANCE), smooth=made.get("interpolation") == "pchip")
+    how = made.get("interpolation")
+    return Station(at, quieted(values, CLEARANCE), how if how in COURSES else "linear")
 
 
 def _quiet(station: Station | None, time: Array, total_field: Array | None) -> Array | None:

@@ -12,6 +12,7 @@ from magtensor.loop.evidence.residual import residual_of
 from magtensor.loop.fitting.log_noise import channels_of
 from magtensor.loop.fitting.model import Record, State, unread
 from magtensor.loop.fitting.refit import without
+from magtensor.loop.remainder.sparse_readings import SparseReadings
 
 LONGEST_SPIKE = 2  # samples: what lasts longer is no accident of the recording
 UNCOVERED = 2.0  # steps between samples
@@ -56,15 +57,18 @@ def unread_words(state: State, record: Record) -> list[str]:
     ]
 
 
-def flagged_words(flagged: Mask, state: State, record: Record) -> tuple[str, bool]:
+def flagged_words(
+    flagged: Mask, state: State, record: Record, sparse: SparseReadings | None = None
+) -> tuple[str, bool]:
     """How many samples were taken out of use because nothing explains them, when, how large, on which sensors; and
-    whether the slow noise of the sensors goes as far, being no outlier of white noise that it is."""
+    whether the slow noise of the sensors goes as far, being no outlier of white noise that it is, or all of them lie
+    between readings of a base station that is read too seldom."""
     raw, reference = without(record, [a.terms(state.excitation) for a in state.adopted], state.theta)
     every = residual_of(replace(state.fit, keep=np.ones(len(flagged), dtype=bool)), raw, reference)
     runs = int(np.sum(np.diff(np.concatenate(([0], flagged.astype(int)))) == 1))
     after = record.time[flagged] - record.start
     shared = 0.0 if every.along is None else float(np.mean(every.along[flagged] ** 2))
-    own = np.zeros(1)
+    own, alike = np.zeros(1), False
     if every.across is not None:
         own = np.mean(every.across[flagged].reshape(int(flagged.sum()), -1, 3) ** 2, axis=(0, 2))
     if every.along is not None and shared > own.max():
@@ -84,6 +88,8 @@ def flagged_words(flagged: Mask, state: State, record: Record) -> tuple[str, boo
         f"calibration, by {amount:.3g} nT rms{where}: they are flagged and have no part in the calibration"
         f"{_at_an_end(flagged, state, record)}"
     )
+    if sparse is not None and alike and sparse.between_readings(flagged, record):
+        return f"{words}; they lie between two readings of the base station", True
     if amount > FAR * usual:
         return words, False
     return f"{words}; slow noise, of {usual:.3g} nT rms there, may go as far", True

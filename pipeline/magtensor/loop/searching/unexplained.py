@@ -25,6 +25,7 @@ from magtensor.loop.remainder.flagged import beyond_the_reference, flagged_words
 from magtensor.loop.remainder.gradient_shape import MODEL, gradient_share
 from magtensor.loop.remainder.jitter import jitter_words
 from magtensor.loop.remainder.predictable import attitude_words, converter_words, shortened_words
+from magtensor.loop.remainder.sparse_readings import sparse_readings
 from magtensor.loop.remainder.tones import of_the_turning
 from magtensor.loop.searching.contribution import happens_once
 from magtensor.loop.searching.found import Search
@@ -45,10 +46,13 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
     state = found.told
     excess = excess_rms(state)
     last = found.steps[-1].candidates if found.steps else ()
-    seen = [c for c in last if c.passes or unlikely(c)]
+    seen = tuple(c for c in last if c.passes or unlikely(c))
     flagged = lasting(disturbed(record, state, found.how), beyond_the_reference(state, record))
     if flagged.any():  # while effects were sought, what lasts was believed
-        seen = [c for c in seen if _still_significant(c, state)]
+        seen = tuple(c for c in seen if _still_significant(c, state))
+    sparse = sparse_readings(state, record)
+    if sparse is not None:  # what lies between the readings looks like an error of theirs
+        last, seen = (tuple(c for c in some if c.model.component.effect != "reference") for some in (last, seen))
     suspects = [c for c in seen if not (c.of_the_log or c.of_second_order or c.of_the_law)]
     words: list[str] = []
     shared = found.shared
@@ -67,6 +71,7 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
     words.extend(jitter_words(state))
     words.extend(one.words for one in changing_matrices(state, ALPHA))
     noise = float(np.hypot(OwnNoise(state.residual, None).slow_along(), of_the_station(state, record)))
+    noise = float(np.hypot(noise, sparse.between if sparse is not None else 0.0))
     if (slow := slow_along(state)) > max(MUCH * state.residual.scale, TWICE * noise):
         words.append(
             f"{slow:.3g} nT rms of |b| - F, in all sensors alike, is no white noise: an error of the base station, or "
@@ -91,13 +96,15 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
         size = f"{excess:.3g} nT rms above the white noise{in_use}, {_where(state)}"
         words.insert(0, size if excess else "in sum no more than the white noise")
     beside = loud_words(state, record, found.how) + unread_words(state, record)
+    if sparse is not None:
+        beside.append(sparse.words)
     if small := [c.model.name for c in seen if c.of_second_order]:
         beside.append(
             f"{' and '.join(small)}: significant, and less than {SECOND_ORDER**0.5:.1%} of the size of what is "
             "adopted, whose law may miss as much"
         )
     if flagged.any():
-        left_out, noise = flagged_words(flagged, state, record)
+        left_out, noise = flagged_words(flagged, state, record, sparse)
         (beside if noise else words).append(left_out)
     present = bool(words)
     untested = [MODEL] if shaped and MODEL in found.not_tested else []

@@ -1,0 +1,106 @@
+"""A record of readings as a course of time: what lies between two of them.
+
+Straight lines follow a random walk best, a spline what is smooth beside the time between readings, a monotone cubic is
+between the two, and the only one that never overshoots. Which is nearest the truth is a question of the record itself:
+each is asked to predict readings that it was not given.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+Course = Literal["pchip", "spline", "linear"]
+COURSES: tuple[Course, ...] = get_args(Course)
+
+LEAST_READINGS = 60  # fewer do not tell two courses apart
+BLOCKS = 10  # of the record: a course that predicts better does so in most of them
+MOST = 0.8  # of the blocks
+BETTER = 0.8  # of the squared error: what a spline gains by less it loses where noise passes through it
+UNEVEN = 1.5  # median steps: a longer one is bridged by the monotone cubic
+ABRUPT = 8.0  # times the usual deviation from the cubic through the neighbours: a step or a spike
+RINGING = 6  # readings to each side of it in which a spline would swing by more than 1/1000
+
+
+def course(time: Floats, values: Floats, how: Course) -> Callable[[Floats], Floats]:
+    """The course through readings; to be asked for times from the first to the last only.
+
+    The spline has the slopes of the natural cubic one, and those of the monotone cubic beside steps, spikes and gaps.
+
+    Args:
+        time: (N,) s, strictly increasing, N >= 2.
+        values: (N,) finite.
+        how: monotone cubic (Fritsch and Carlson 1980, as PCHIP), cubic spline, or straight lines.
+    """
+    if how == "linear" or len(time) < 3:
+        return lambda at: np.interp(at, time, values)
+    from scipy.interpolate import CubicHermiteSpline, CubicSpline, PchipInterpolator
+
+    monotone = PchipInterpolator(time, values)
+    if how == "pchip":
+        return monotone
+    slopes = np.where(abrupt(time, values), monotone(time, 1), CubicSpline(time, values, bc_type="natural")(time, 1))
+    return CubicHermiteSpline(time, values, slopes)
+
+
+def followed_best(time: Floats, values: Floats) -> Course:
+    """The spline where it clearly predicts a record better than the monotone cubic; else that.
+
+    Every second reading is left out and predicted from the others, twice as far apart as they are. Readings of white
+    noise, or of a random walk, are predicted worse by the spline.
+
+    Args:
+        time: (N,) s, strictly increasing; values: (N,) finite.
+    """
+    if len(time) < LEAST_READINGS:
+        return "pchip"
+    kept_out = abrupt(time, values)
+    squares = np.zeros((2, len(time)))
+    for first in (0, 1):
+        given = np.arange(first, len(time), 2)
+        asked = np.arange(first + 1, given[-1], 2)
+        for square, how in zip(squares, COURSES[:2], strict=True):
+            square[asked] = (course(time[given], values[given], how)(time[asked]) - values[asked]) ** 2
+    squares[:, kept_out] = 0.0
+    monotone, spline = (np.add.reduceat(s, np.linspace(0, len(s), BLOCKS, endpoint=False).astype(int)) for s in squares)
+    surely = spline.sum() < BETTER * monotone.sum() and np.mean(spline < monotone) >= MOST
+    return "spline" if surely else "pchip"
+
+
+def abrupt(time: Floats, values: Floats) -> Bools:
+    """(N,) True at readings beside a step, a spike or a gap of the record.
+
+    Args:
+        time: (N,) s, increasing; values: (N,).
+    """
+    from scipy.ndimage import binary_dilation, correlate1d
+
+    if len(time) < 5:
+        return np.ones(len(time), dtype=bool)
+    strays = np.abs(correlate1d(values, np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / 6.0, mode="nearest"))
+    strays[[0, 1, -2, -1]] = 0.0  # where the record ends it has no neighbours
+    steps = np.diff(time)
+    found = strays > ABRUPT * np.sqrt(np.mean(np.sort(strays**2)[: -(-len(strays) * 9 // 10)]))
+    long = steps > UNEVEN * np.median(steps)
+    found[1:] |= long
+    found[:-1] |= long
+    out: Bools = binary_dilation(found, iterations=RINGING)
+    return out
+
+
+def noise_gain(how: Course, place: Floats) -> Floats:
+    """(M,) by how much independent noise of evenly spaced readings is scaled at places (M,) between two of them, 0 to
+    1; of the monotone cubic, which is not linear, that of straight lines."""
+    if how != "spline":
+        return np.hypot(1.0 - place, place)
+    from scipy.interpolate import CubicSpline
+
+    around = np.arange(-8.0, 10.0)  # a reading further away has less than 1/10000
+    fine = np.linspace(0.0, 1.0, 65)
+    weights = CubicSpline(around, np.eye(len(around)), bc_type="natural")(fine)
+    return np.interp(place, fine, np.sqrt(np.sum(weights**2, axis=1)))

@@ -1,0 +1,86 @@
+"""A base station that is read too seldom: what is left is larger midway between its readings than at them.
+
+Nothing else knows when the station was read. Its own noise is largest at the readings, where no neighbour lessens it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from magtensor.calibration.types import Array, Mask
+from magtensor.loop.fitting.model import Record, State
+
+ALPHA = 0.001
+BLOCKS = 20
+LEAST_PER_BLOCK = 30
+POWERS = (0.5, 1.0, 2.0)  # of the profile: what is faster than the readings, a random walk, a curve that bends evenly
+EACH = 1.5  # samples to a reading: with fewer, few are far from one
+
+
+@dataclass(frozen=True)
+class SparseReadings:
+    """What is left of |b| - F beside and between the readings of the base station.
+
+    Attributes:
+        step_s: between two readings; at, midway: nT rms; between: nT rms over all samples beyond what is at them.
+    """
+
+    step_s: float
+    at: float
+    midway: float
+    between: float
+
+    @property
+    def words(self) -> str:
+        """What they say."""
+        return (
+            f"{self.midway:.3g} nT rms of |b| - F midway between the base station's readings, which are "
+            f"{self.step_s:.4g} s apart, and {self.at:.3g} nT at them: it is read too seldom for a field that moves so "
+            "fast"
+        )
+
+    def between_readings(self, some: Mask, record: Record) -> bool:
+        """Whether each run of some samples (N,) lies between two readings."""
+        assert record.station is not None
+        edges = np.flatnonzero(np.diff(np.concatenate(([0], some.astype(int), [0])))).reshape(-1, 2)
+        before = np.searchsorted(record.station.time, record.time, side="right")
+        return bool((before[edges[:, 0]] == before[edges[:, 1] - 1]).all())
+
+
+def sparse_readings(state: State, record: Record) -> SparseReadings | None:
+    """What the place between two readings says of the residual's square; None where it says nothing."""
+    from scipy.special import bdtrc, stdtr
+
+    residual, station = state.residual, record.station
+    if residual.along is None or station is None or len(residual.along) < BLOCKS * LEAST_PER_BLOCK:
+        return None
+    time = record.time[residual.samples]
+    if station.step_s < EACH * float(np.median(np.diff(time))):
+        return None
+    after = np.clip(np.searchsorted(station.time, time, side="right"), 1, len(station.time) - 1)
+    place = np.clip((time - station.time[after - 1]) / (station.time[after] - station.time[after - 1]), 0.0, 1.0)
+    between = 4.0 * place * (1.0 - place)
+    square = (residual.along / residual.reference_gain) ** 2
+    growth = []
+    for y, z in zip(np.array_split(square, BLOCKS), np.array_split(between, BLOCKS), strict=True):
+        off = z - z.mean()
+        growth.append(float(off @ y) / max(float(off @ off), 1e-300))
+    mean, error = float(np.mean(growth)), float(np.std(growth, ddof=1)) / np.sqrt(BLOCKS)
+    p_mean = float(stdtr(BLOCKS - 1, -mean / max(error, 1e-300)))
+    p_signs = float(bdtrc(int(np.sum(np.array(growth) > 0)) - 1, BLOCKS, 0.5))  # whatever comes in a single burst
+    if mean <= 0 or 2.0 * min(p_mean, p_signs) > ALPHA:
+        return None
+    best = min((_level(square, between**power) for power in POWERS), key=lambda level: level[0])
+    at, midway, beyond = np.sqrt(np.maximum(best[1:], 0.0))
+    return SparseReadings(station.step_s, float(at), float(midway), float(beyond))
+
+
+def _level(square: Array, profile: Array) -> tuple[float, float, float, float]:
+    """What a profile between readings leaves of a square (N,), and the square at them, midway, and beyond what is at
+    them."""
+    columns = np.column_stack([np.ones_like(profile), profile])
+    (base, slope), *_ = np.linalg.lstsq(columns, square, rcond=None)
+    left = float(np.sum((square - base - slope * profile) ** 2))
+    return left, float(base), float(base + slope), float(slope * profile.mean())

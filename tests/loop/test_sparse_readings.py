@@ -1,0 +1,38 @@
+"""A base station that is read too seldom: told for what it is, and no fault of its clock."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from loop_cases import linear_state, loaded, scenario, verdict_of
+
+from magtensor.loop.remainder.sparse_readings import sparse_readings
+
+
+def survey(seed: int, period_s: float, rms_nT: float, **station: Any) -> dict[str, Any]:
+    made = scenario(seed)
+    made["field"]["variation"] = {
+        "pulsations": [{"rms_nT": rms_nT, "period_s": period_s}, {"rms_nT": rms_nT, "period_s": 1.7 * period_s}],
+        "irregular": {"rms_nT": 10.0, "time_s": 300.0},
+    }
+    made["base_station"] |= station
+    return made
+
+
+@pytest.mark.parametrize("seed", [201, 202])
+def test_it_is_told_beside_the_noise(seed: int, tmp_path: Path) -> None:
+    """Two waves of 3 nT rms, of 22 and 37 s, read every 10 s."""
+    told = verdict_of(tmp_path, survey(seed, 22.0, 3.0, rate_Hz=0.1), None, ["reference_clock", "reference_scale"])
+    description = told["unexplained"]["description"]
+    assert not told["adopted"] and not told["unexplained"]["present"], description
+    assert "which are 10 s apart" in description and "read too seldom" in description
+    assert not told["unexplained"]["looks_like"]
+
+
+@pytest.mark.parametrize("seed", range(301, 307))
+@pytest.mark.parametrize("station", [{"rate_Hz": 0.2}, {"rate_Hz": 0.2, "noise_sd_nT": 1.0}, {"rate_Hz": 2.0}])
+def test_what_is_read_often_enough_is_not(seed: int, station: dict[str, float], tmp_path: Path) -> None:
+    record = loaded(tmp_path, survey(seed, 120.0, 1.0, **station))
+    assert sparse_readings(linear_state(record), record) is None
