@@ -14,11 +14,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from magtensor.calibration.joint import calibrated
 from magtensor.calibration.types import Array
 from magtensor.components import Component
 from magtensor.error_models.direction import attitude_series, curve_series
 from magtensor.error_models.terms import joined
 from magtensor.error_models.waveform import NAME, Course, course_of, free_directions
+from magtensor.loop.correcting.correction import hidden_objection
 from magtensor.loop.evidence.assessment import Assessment, estimated
 from magtensor.loop.evidence.colour import beside_the_field
 from magtensor.loop.evidence.factor import Groups, noise_alone, with_factor
@@ -50,6 +52,7 @@ LEAST_SENSORS = 3  # from here on noise of single sensors does not imitate a fac
 QUIET = 5.0  # times the median square of a step: of a few dozen values none is as large by chance
 LEVEL_ROUNDS = 3
 LEAST_NOISE = 0.1  # of what the fit believes
+IMPROPER = 1 / 3  # of the noise of a sensor's usual axis
 SINGLE_STRETCH = "it acts in a single short stretch, which no other can confirm"
 ONCE = 0.9  # of a waveform's power in a stretch as long as one that is held out
 OF_A_CHANNEL = "its waveform follows channel"
@@ -214,6 +217,8 @@ def tried_source(
         return replace(found, objection="its waveform follows the direction of the field"), None
     model = Adopted(component, {"noise_nT": [float(f"{v:.4g}") for v in _own_noise(after)]})
     after = replace(after, adopted=(*after.adopted[:-1], model))
+    if why := hidden_objection(record, calibrated(after.fit), after.adopted, after.theta, after.fit.keep):
+        return replace(found, objection=f"a correction would not take it off: {why}"), None
     gain = found.gain
     folds, p = Blocks.equal(len(state.residual.affine)), found.p
     evidence = Assessment(estimate, folds, gain, gain, None, None, p, p, p, 0.0, state.colours, estimate.theta)
@@ -226,7 +231,8 @@ def _own_noise(state: State) -> Array:
 
     From differences of neighbouring samples in which the source is left: its waveform, one value a sample, has taken
     with it the most of the noise of those outputs that feel it most. Where it is so fast that they share it, it is the
-    factor beside that noise.
+    factor beside that noise. A factor that is one output and hardly more leaves it next to no noise (a Heywood case):
+    then that output has as much as the sensor's others.
     """
     put_back = _put_back(state)
     assert put_back is not None
@@ -238,7 +244,10 @@ def _own_noise(state: State) -> Array:
     found = noise_alone(covariance, basis, groups)
     if found.log_p(len(quiet)) < np.log(ALPHA):
         found = with_factor(covariance, basis, groups, found)
-    out: Array = state.residual.noise * np.sqrt(np.maximum(np.diag(found.noise), LEAST_NOISE**2))
+    noise = state.residual.noise * np.sqrt(np.maximum(np.diag(found.noise), LEAST_NOISE**2))
+    axes = noise.reshape(-1, 3)
+    usual = np.median(axes, axis=1, keepdims=True)
+    out: Array = np.where(axes < IMPROPER * usual, usual, axes).ravel()
     return out
 
 
