@@ -15,6 +15,7 @@ from magtensor.loop.evidence.folds import FOLDS
 from magtensor.loop.fitting.log_noise import channels_of
 from magtensor.loop.fitting.model import Record, State
 from magtensor.loop.remainder.curve_of_a_channel import PIECES
+from magtensor.loop.searching.contribution import happens_once
 
 LIKE_A_CHANNEL = 0.7  # correlation from which a logged channel is the suspect and no hidden source
 MOST_LAG = 0.1  # of the survey, in which a channel is compared with the waveform
@@ -110,10 +111,10 @@ def effect_along(state: State, basis: Array, direction: Array) -> str:
 
 
 def event_along(state: State, terms: Terms, theta: Array) -> str:
-    """The adopted error model that follows a channel and whose own vector at the sensors is that of something that
-    happened once; "" where there is none. A law of a channel that no model has, a play or a delay that changes, leaves
-    that where it is furthest off. Not asked of what one sensor makes alone: the three numbers of two such vectors agree
-    by chance one time in ten.
+    """The adopted error model that follows a channel, or the source nobody logged, whose own vector at the sensors is
+    that of something that happened once; "" where there is none. A law of a channel that no model has, a play or a
+    delay that changes, leaves that where it is furthest off, and so does a waveform that was smoothed. Not asked of
+    what one sensor makes alone: the three numbers of two such vectors agree by chance one time in ten.
 
     Parameters
     ----------
@@ -127,9 +128,27 @@ def event_along(state: State, terms: Terms, theta: Array) -> str:
     if each.max() >= ONE_SENSOR * each.sum():  # or what is of the reference, and moves none
         return ""
     direction = np.linalg.svd((moved - moved.mean(axis=0)) @ basis, full_matrices=False)[2][0]
-    following = [i for i, a in enumerate(state.adopted) if channels_of(a, state.excitation)]
+    following = [i for i, a in enumerate(state.adopted) if channels_of(a, state.excitation) or a.name == NAME]
     some = replace(state, adopted=tuple(state.adopted[i] for i in following))
     return effect_along(replace(some, theta=tuple(state.theta[i] for i in following)), basis, direction)
+
+
+def part_of_the_source(state: State, place: int) -> bool:
+    """Whether an adopted model of something that happened once moves its sensors as the source nobody logged does, that
+    was adopted after it: a part of that source's course. Of one sensor the three numbers of two vectors agree by
+    chance."""
+    event, source = state.adopted[place], next((i for i, a in enumerate(state.adopted) if a.name == NAME), None)
+    if source is None or not happens_once(event):
+        return False
+    outputs = len(state.residual.noise)
+    moved = event.terms(state.excitation).contribution(state.theta[place], outputs) / state.residual.noise
+    power = np.sum(moved**2, axis=0)
+    own = np.repeat(power.reshape(-1, 3).sum(axis=1) > 0, 3)
+    if own.sum() <= 3:
+        return False
+    vector = np.linalg.svd((moved - moved.mean(axis=0))[:, own], full_matrices=False)[2][0]
+    other = (state.theta[source] / state.residual.noise)[own]
+    return bool(abs(vector @ other) > LIKE_AN_EFFECT * float(np.linalg.norm(other)))
 
 
 def of_an_unseen_path(state: State) -> list[int]:

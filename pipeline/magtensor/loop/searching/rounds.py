@@ -21,7 +21,7 @@ from magtensor.loop.searching.gates import Candidate
 from magtensor.loop.searching.keeping import ONE_OF_A_KIND, UNEARNED, Fitted, fitted, why_not
 from magtensor.loop.searching.larger_law import part_of_a_larger_law
 from magtensor.loop.searching.latent import NAME, Sought, Source, renewed, sought, tried_source
-from magtensor.loop.searching.likeness import followed_by_a_curve
+from magtensor.loop.searching.likeness import followed_by_a_curve, part_of_the_source
 from magtensor.loop.searching.own_fit import at_their_own_fit
 from magtensor.loop.searching.profiling import repeatable
 from magtensor.loop.searching.rivals import containing, overlaps, part_of, part_of_a_drift, simplest
@@ -276,6 +276,9 @@ class Rounds:
             self.say(f"adopting {NAME}")
         record, state = source.record, source.after
         last, dropped = eliminate(record, state, how, self.fixed)
+        if parts := [i for i in range(self.fixed, len(last.adopted)) if part_of_the_source(last, i)]:
+            dropped = (*dropped, *(last.adopted[i].name for i in parts))
+            last = without_models(record, last, parts, how)
         if dropped and NAME not in dropped:  # what had taken a part of the source for its own
             record, state = renewed(record, last, how)
         gone = (*([instead] if instead else []), *(() if NAME in dropped else dropped))
