@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import h5py
+import numpy as np
 import pytest
 from loop_cases import linear_state, loaded, scenario, verdict_of
 
@@ -36,3 +38,40 @@ def test_it_is_told_beside_the_noise(seed: int, tmp_path: Path) -> None:
 def test_what_is_read_often_enough_is_not(seed: int, station: dict[str, float], tmp_path: Path) -> None:
     record = loaded(tmp_path, survey(seed, 120.0, 1.0, **station))
     assert sparse_readings(linear_state(record), record) is None
+
+
+def without_readings(path: Path, first: int, last: int) -> None:
+    with h5py.File(path, "a") as file:
+        station = file["reference"]
+        kept = np.r_[0:first, last : len(station["time"])]
+        for name in ("time", "total_field"):
+            values, attributes = station[name][kept], dict(station[name].attrs)
+            del station[name]
+            station[name] = values
+            station[name].attrs.update(attributes)
+
+
+@pytest.mark.parametrize(("seed", "lost"), [(402, 2), (403, 3)])
+def test_a_gap_of_the_base_station_is_no_event(seed: int, lost: int, tmp_path: Path) -> None:
+    """Readings are lost while waves of 3 nT pass: the field that nobody read there is the same for all sensors."""
+    made = survey(seed, 22.0, 3.0, rate_Hz=0.2)
+    events = ["passing_source", "reference_step", "scale_step"]
+    told = verdict_of(tmp_path, made, lambda path: without_readings(path, 130, 130 + lost), events)
+    assert not told["adopted"] and not told["unexplained"]["present"], told["unexplained"]["description"]
+
+
+def test_what_lies_in_a_gap_is_not_used_unless_it_is_much(tmp_path: Path) -> None:
+    made = survey(402, 120.0, 1.0, rate_Hz=0.2)
+    whole = loaded(tmp_path, made)
+    short = loaded(tmp_path, made, lambda path: without_readings(path, 130, 132))
+    assert whole.station is not None
+    begin, end = whole.station.time[[129, 132]]
+    inside = (whole.time > begin) & (whole.time < end)
+    assert inside.sum() == pytest.approx(30, abs=1)  # 15 s, two samples a second
+    np.testing.assert_array_equal(short.time, whole.time[~inside])
+
+    def often(path: Path) -> None:
+        for first in range(40, 240, 10):
+            without_readings(path, first, first + 1)
+
+    assert len(loaded(tmp_path, made, often).time) == len(whole.time)

@@ -22,6 +22,8 @@ NOT_CHANNELS = (
 )  # fmt: skip
 CLEARANCE = 10.0  # the reference's noise is in the residual too: what held it would seem to explain it
 GAP = 5.0  # median steps: a longer one begins a new run
+FURTHER_APART = 1.5  # median steps of the base station
+FEW = 0.05  # of the samples
 
 
 def record_of(
@@ -43,6 +45,7 @@ def record_of(
     raw = np.asarray(survey.values("b_raw"), dtype=float)
     time = survey.time
     total_field = np.asarray(survey.values("total_field"), dtype=float) if "total_field" in survey else None
+    station = _station(survey)
     steady = every or use is not None
     if use is None and every:
         use = np.ones(len(time), dtype=bool)
@@ -50,6 +53,7 @@ def record_of(
         use = survey.readings & np.isfinite(raw).all(axis=(1, 2))
         if total_field is not None:
             use &= np.isfinite(total_field)
+            use = _where_read(use, time, station)
     logged, units = channels_of(survey)
     for name, values in list(logged.items()):
         finite = np.asarray(np.isfinite(values.reshape(len(values), -1)).all(axis=1))
@@ -64,7 +68,6 @@ def record_of(
     if not steady:  # what never changes says nothing
         centred = {n: v for n, v in centred.items() if np.ptp(v[keep], axis=0).max(initial=0.0) > 0}
     segment = np.asarray(survey.values("segment"), dtype=int) if "segment" in survey else np.zeros(len(time), dtype=int)
-    station = _station(survey)
     whole = Record(
         time=time,
         start=float(time[0]),
@@ -143,6 +146,18 @@ def _station(survey: Survey) -> Station | None:
     at = at - float(made.get("latency_s", 0.0))
     how = made.get("interpolation")
     return Station(at, quieted(values, CLEARANCE), how if how in COURSES else "linear")
+
+
+def _where_read(use: NDArray[np.bool_], time: Array, station: Station | None) -> NDArray[np.bool_]:
+    """Without the samples between two readings of the base station that are further apart than usual, where these are
+    few: what the field did there, in all sensors alike, would look like something that passed."""
+    if station is None:
+        return use
+    step = np.diff(station.time)
+    after = np.clip(np.searchsorted(station.time, time, side="right"), 1, len(step))
+    apart = step[after - 1] > FURTHER_APART * np.median(step)
+    between = apart & (time > station.time[after - 1]) & (time < station.time[after])
+    return use & ~between if between[use].sum() <= FEW * use.sum() else use
 
 
 def _quiet(station: Station | None, time: Array, total_field: Array | None) -> Array | None:
