@@ -23,14 +23,15 @@ BLOCKS = 10  # of the record: a course that predicts better does so in most of t
 MOST = 0.8  # of the blocks
 BETTER = 0.8  # of the squared error: what a spline gains by less it loses where noise passes through it
 UNEVEN = 1.5  # median steps: a longer one is bridged by the monotone cubic
-ABRUPT = 8.0  # times the usual deviation from the cubic through the neighbours: a step or a spike
-RINGING = 6  # readings to each side of it in which a spline would swing by more than 1/1000
+ABRUPT = 8.0  # times the usual difference between a change and those beside it: a step or a spike
+BESIDE = 3  # readings to each side of a break, which say nothing of a course
+LEAST_PIECE = 6  # readings between two breaks that a spline goes through
 
 
 def course(time: Floats, values: Floats, how: Course) -> Callable[[Floats], Floats]:
     """The course through readings; to be asked for times from the first to the last only.
 
-    The spline has the slopes of the natural cubic one, and those of the monotone cubic beside steps, spikes and gaps.
+    The spline is broken at steps, spikes and gaps, in which it would ring: these are crossed by the monotone cubic.
 
     Args:
         time: (N,) s, strictly increasing, N >= 2.
@@ -39,13 +40,17 @@ def course(time: Floats, values: Floats, how: Course) -> Callable[[Floats], Floa
     """
     if how == "linear" or len(time) < 3:
         return lambda at: np.interp(at, time, values)
-    from scipy.interpolate import CubicHermiteSpline, CubicSpline, PchipInterpolator
+    from scipy.interpolate import CubicSpline, PchipInterpolator, PPoly
 
     monotone = PchipInterpolator(time, values)
     if how == "pchip":
         return monotone
-    slopes = np.where(abrupt(time, values), monotone(time, 1), CubicSpline(time, values, bc_type="natural")(time, 1))
-    return CubicHermiteSpline(time, values, slopes)
+    pieces = np.array(monotone.c)
+    for first, last in _runs(~breaks(time, values)):
+        if last - first + 1 >= LEAST_PIECE:
+            own = slice(first, last + 1)
+            pieces[:, first:last] = CubicSpline(time[own], values[own]).c
+    return PPoly(pieces, time)
 
 
 def followed_best(time: Floats, values: Floats) -> Course:
@@ -59,38 +64,40 @@ def followed_best(time: Floats, values: Floats) -> Course:
     """
     if len(time) < LEAST_READINGS:
         return "pchip"
-    kept_out = abrupt(time, values)
     squares = np.zeros((2, len(time)))
     for first in (0, 1):
         given = np.arange(first, len(time), 2)
         asked = np.arange(first + 1, given[-1], 2)
         for square, how in zip(squares, COURSES[:2], strict=True):
             square[asked] = (course(time[given], values[given], how)(time[asked]) - values[asked]) ** 2
-    squares[:, kept_out] = 0.0
+    broken = np.convolve(breaks(time, values), np.ones(2 * BESIDE))[BESIDE - 1 :][: len(time)] > 0
+    squares[:, broken] = 0.0
     monotone, spline = (np.add.reduceat(s, np.linspace(0, len(s), BLOCKS, endpoint=False).astype(int)) for s in squares)
     surely = spline.sum() < BETTER * monotone.sum() and np.mean(spline < monotone) >= MOST
     return "spline" if surely else "pchip"
 
 
-def abrupt(time: Floats, values: Floats) -> Bools:
-    """(N,) True at readings beside a step, a spike or a gap of the record.
+def breaks(time: Floats, values: Floats) -> Bools:
+    """(N - 1,) True between two readings where the record steps, beside a spike, and in a gap.
 
     Args:
         time: (N,) s, increasing; values: (N,).
     """
-    from scipy.ndimage import binary_dilation, correlate1d
-
-    if len(time) < 5:
-        return np.ones(len(time), dtype=bool)
-    strays = np.abs(correlate1d(values, np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / 6.0, mode="nearest"))
-    strays[[0, 1, -2, -1]] = 0.0  # where the record ends it has no neighbours
-    steps = np.diff(time)
-    found = strays > ABRUPT * np.sqrt(np.mean(np.sort(strays**2)[: -(-len(strays) * 9 // 10)]))
-    long = steps > UNEVEN * np.median(steps)
-    found[1:] |= long
-    found[:-1] |= long
-    out: Bools = binary_dilation(found, iterations=RINGING)
+    steps, changes = np.diff(time), np.diff(values)
+    if len(changes) < 5:
+        return np.ones(len(changes), dtype=bool)
+    padded = np.pad(changes, 2, mode="reflect")
+    beside = np.stack([padded[k : k + len(changes)] for k in (0, 1, 3, 4)])
+    off = np.abs(changes - np.median(beside, axis=0))
+    usual = np.sqrt(np.mean(np.sort(off**2)[: -(-len(off) * 9 // 10)]))
+    out: Bools = (off > ABRUPT * usual) | (steps > UNEVEN * np.median(steps))
     return out
+
+
+def _runs(some: Bools) -> list[tuple[int, int]]:
+    """The first and last reading of each run of unbroken intervals (N - 1,)."""
+    edges = np.flatnonzero(np.diff(np.concatenate(([0], some.astype(int), [0]))))
+    return list(zip(edges[0::2].tolist(), edges[1::2].tolist(), strict=True))
 
 
 def noise_gain(how: Course, place: Floats) -> Floats:
