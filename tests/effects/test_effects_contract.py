@@ -7,6 +7,7 @@ from typing import Annotated
 
 import numpy as np
 import pytest
+from pydantic import Field
 
 import magtensor_effects
 from magtensor.components import Component, component_of, error_model
@@ -198,9 +199,30 @@ def out_of_range(x, *, tau_s: Annotated[float, Range(1.0, 10.0)] = 20.0):
     return x.offsets(np.exp(-x.elapsed / tau_s), "nT")
 
 
+@error_model("instrument", needs=("charge_flow",), source="a diode", typical="1 nT")
+def one_way(
+    x,
+    *,
+    threshold: Annotated[float, Range(-8.0, 1e6, count=5, spacing="linear"), Field(description="C/s")] = 0.0,
+):
+    """A current that flows one way, from a threshold on: with the largest of them never."""
+    return x.offsets(np.maximum(x.channel("charge_flow") - threshold, 0.0), "nT/(C/s)")
+
+
+@error_model("instrument", needs=("charge_flow",), source="nowhere", typical="1 nT")
+def never(x, *, threshold: Annotated[float, Range(1e5, 1e6), Field(description="C/s")] = 1e5):
+    """A threshold that nothing ever reaches."""
+    return x.offsets(np.maximum(x.channel("charge_flow") - threshold, 0.0), "nT/(C/s)")
+
+
+def test_a_threshold_beyond_the_channel_is_no_fault() -> None:
+    assert check_error_model(one_way) == []
+
+
 @pytest.mark.parametrize(
     ("candidate", "told"),
     [
+        (never, ["zero throughout, with whatever settings"]),
         (backwards, ["called again", "no units", "kind instrument but acts on the reference"]),
         (endless, ["not all finite"]),
         (out_of_range, ["tau_s: the default 20.0 is not between 1.0 and 10.0", "tau_s has no description"]),
