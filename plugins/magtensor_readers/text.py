@@ -86,7 +86,7 @@ def _lines(path: Path, comment: str, skip: int) -> list[tuple[int, str]]:
         raise DataError(
             f"this is a binary file, not text (it starts with {start[:8]!r})",
             where=path.name,
-            hint="name its reader in the recipe's survey section; `apply` reads surveys as the calibration's recipe does",
+            hint="name its reader in the recipe's survey section; `apply` reads as the calibration's recipe does",
         )
     # Not str.splitlines: form feeds and other separators inside a corrupt row must not make new rows.
     lines = raw.decode(encoding, "replace").replace("\r\n", "\n").replace("\r", "\n").split("\n")
