@@ -75,3 +75,13 @@ def test_what_lies_in_a_gap_is_not_used_unless_it_is_much(tmp_path: Path) -> Non
             without_readings(path, first, first + 1)
 
     assert len(loaded(tmp_path, made, often).time) == len(whole.time)
+
+
+@pytest.mark.parametrize("seed", [406, 411])
+def test_what_passes_for_a_delay_and_is_none_is_no_rest(seed: int, tmp_path: Path) -> None:
+    """Waves of 18 and 31 s read every five seconds: what a monotone cubic leaves of them looks like a delay, by half of
+    whatever lag it is taken over."""
+    made = survey(seed, 18.0, 1.5, rate_Hz=0.2)
+    told = verdict_of(tmp_path, made, lambda path: without_readings(path, 130, 133), ["reference_clock"])
+    assert not told["adopted"] and not told["unexplained"]["present"], told["unexplained"]["description"]
+    assert "reference_clock: significant, but as noise of the base station" in told["unexplained"]["description"]

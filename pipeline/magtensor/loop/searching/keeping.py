@@ -24,6 +24,7 @@ from magtensor.loop.searching.likeness import event_along
 from magtensor.loop.searching.profiling import already
 from magtensor.loop.searching.rivals import hardly_begun
 
+NOT_AS_ASSUMED = "fitted, its coefficients are not what its settings assume"
 ONE_OF_A_KIND = "fitted, its settings are those of what is adopted already"  # its law is no single one
 MOST_OF_DIFFERENCES = 0.1  # positions wrong by a tenth of the array, where its law ends to be of first order
 UNEARNED = "fitted, it does not earn its place on held-out blocks"
@@ -85,7 +86,7 @@ def why_not(before: Trial, after: Trial, chosen: Candidate, how: Fitting) -> str
     if at_its_limit(model.component, model.settings, x):
         return "fitted, it would have begun as far from what it follows as is possible: something else dies away"
     if not agrees(after.state, which):
-        return "fitted, its coefficients are not what its settings assume"
+        return NOT_AS_ASSUMED
     if (share := share_of_differences(after.state, which)) > MOST_OF_DIFFERENCES:
         return f"fitted, it makes {share:.0%} of what differs between the sensors: no small error"
     if how.nominal is not None and (share := share_of_the_field(after.state, which)) > how.nominal.scale:

@@ -30,6 +30,7 @@ from magtensor.loop.remainder.tones import of_the_turning
 from magtensor.loop.searching.contribution import happens_once
 from magtensor.loop.searching.found import Search
 from magtensor.loop.searching.gates import SECOND_ORDER, Candidate
+from magtensor.loop.searching.keeping import NOT_AS_ASSUMED
 from magtensor.loop.searching.latent import shared_words
 
 ALPHA = 0.001  # of each of the tests
@@ -50,9 +51,15 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
     flagged = lasting(disturbed(record, state, found.how), beyond_the_reference(state, record))
     if flagged.any():  # while effects were sought, what lasts was believed
         seen = tuple(c for c in seen if _still_significant(c, state))
+    refused = found.steps[-1].refused if found.steps else {}
     sparse = sparse_readings(state, record)
-    if sparse is not None:  # what lies between the readings looks like an error of theirs
-        last, seen = (tuple(c for c in some if c.model.component.effect != "reference") for some in (last, seen))
+    # what lies between the readings looks like an error of theirs, and so does their noise
+    reference = {c.model.name for c in last if c.model.component.effect == "reference"}
+    noisy = reference if sparse is not None else {n for n in reference if refused.get(n) == NOT_AS_ASSUMED}
+    of_the_noise = [c.model.name for c in seen if c.model.name in noisy]
+    seen = tuple(c for c in seen if c.model.name not in noisy)
+    if sparse is not None:
+        last = tuple(c for c in last if c.model.name not in noisy)
     suspects = [c for c in seen if not (c.of_the_log or c.of_second_order or c.of_the_law)]
     words: list[str] = []
     shared = found.shared
@@ -78,7 +85,6 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
             "a field at the site that it does not see"
         )
     gradient = gradient_share(state, record.position)
-    refused = found.steps[-1].refused if found.steps else {}
     if open_ := [c.model.name for c in suspects if c.passes]:
         named = [f"{name} ({refused[name]})" if name in refused else name for name in open_]
         words.append(f"significant, passes the first two gates of the loop and is not adopted: {', '.join(named)}")
@@ -98,6 +104,11 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
     beside = loud_words(state, record, found.how) + unread_words(state, record)
     if sparse is not None:
         beside.append(sparse.words)
+    elif of_the_noise:
+        beside.append(
+            f"{' and '.join(of_the_noise)}: significant, but as noise of the base station, or the field between its "
+            "readings, would make it"
+        )
     if small := [c.model.name for c in seen if c.of_second_order]:
         beside.append(
             f"{' and '.join(small)}: significant, and less than {SECOND_ORDER**0.5:.1%} of the size of what is "
