@@ -12,6 +12,8 @@ from loop_cases import linear_state, loaded, scenario, verdict_of
 
 from magtensor.loop.remainder.sparse_readings import sparse_readings
 
+LONG = pytest.mark.long
+
 
 def survey(seed: int, period_s: float, rms_nT: float, **station: Any) -> dict[str, Any]:
     made = scenario(seed)
@@ -23,7 +25,7 @@ def survey(seed: int, period_s: float, rms_nT: float, **station: Any) -> dict[st
     return made
 
 
-@pytest.mark.parametrize("seed", [201, 202])
+@pytest.mark.parametrize("seed", [201, pytest.param(202, marks=LONG)])
 def test_it_is_told_beside_the_noise(seed: int, tmp_path: Path) -> None:
     """Two waves of 3 nT rms, of 22 and 37 s, read every 10 s."""
     told = verdict_of(tmp_path, survey(seed, 22.0, 3.0, rate_Hz=0.1), None, ["reference_clock", "reference_scale"])
@@ -33,7 +35,7 @@ def test_it_is_told_beside_the_noise(seed: int, tmp_path: Path) -> None:
     assert not told["unexplained"]["looks_like"]
 
 
-@pytest.mark.parametrize("seed", range(301, 307))
+@pytest.mark.parametrize("seed", [301, 302, *(pytest.param(seed, marks=LONG) for seed in range(303, 307))])
 @pytest.mark.parametrize("station", [{"rate_Hz": 0.2}, {"rate_Hz": 0.2, "noise_sd_nT": 1.0}, {"rate_Hz": 2.0}])
 def test_what_is_read_often_enough_is_not(seed: int, station: dict[str, float], tmp_path: Path) -> None:
     record = loaded(tmp_path, survey(seed, 120.0, 1.0, **station))
@@ -51,7 +53,7 @@ def without_readings(path: Path, first: int, last: int) -> None:
             station[name].attrs.update(attributes)
 
 
-@pytest.mark.parametrize(("seed", "lost"), [(402, 2), (403, 3)])
+@pytest.mark.parametrize(("seed", "lost"), [(402, 2), pytest.param(403, 3, marks=LONG)])
 def test_a_gap_of_the_base_station_is_no_event(seed: int, lost: int, tmp_path: Path) -> None:
     """Readings are lost while waves of 3 nT pass: the field that nobody read there is the same for all sensors."""
     made = survey(seed, 22.0, 3.0, rate_Hz=0.2)
@@ -77,7 +79,7 @@ def test_what_lies_in_a_gap_is_not_used_unless_it_is_much(tmp_path: Path) -> Non
     assert len(loaded(tmp_path, made, often).time) == len(whole.time)
 
 
-@pytest.mark.parametrize("seed", [406, 411])
+@pytest.mark.parametrize("seed", [406, pytest.param(411, marks=LONG)])
 def test_what_passes_for_a_delay_and_is_none_is_no_rest(seed: int, tmp_path: Path) -> None:
     """Waves of 18 and 31 s read every five seconds: what a monotone cubic leaves of them looks like a delay, by half of
     whatever lag it is taken over."""
