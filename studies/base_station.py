@@ -15,10 +15,8 @@ white noise of the size given; or it has lost three readings in the middle. The 
 
 from __future__ import annotations
 
-import argparse
 import itertools
 import os
-import sys
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from functools import cache, partial
@@ -136,14 +134,7 @@ def planned(seeds: int) -> Iterator[Trial]:
 
 def main() -> None:
     """Run what is missing and write the page."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    trials.add_options(parser)
-    parser.add_argument("--page", type=Path, help="write the table here")
-    parser.add_argument("--seeds", type=int, default=1, help="surveys of each kind")
-    chosen = parser.parse_args()
-    rows, open_ = trials.rows_of(chosen, planned(chosen.seeds), trials.named(Trial), tried, line)
-    if chosen.page:
-        chosen.page.write_text(page(f"python studies/base_station.py {' '.join(sys.argv[1:])}", rows, open_))
+    trials.study(__file__, __doc__, Trial, planned, tried, line, page)
 
 
 if __name__ == "__main__":

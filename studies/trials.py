@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import sys
 import time
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -59,6 +60,34 @@ def rows_of(
             out.flush()
             print(line(row), flush=True)
     return rows, open_
+
+
+def study(
+    script: str,
+    words: str | None,
+    kind: Any,
+    planned: Callable[[int], Iterable[tuple[Any, ...]]],
+    tried: Callable[[Any], Row],
+    line: Callable[[Row], str],
+    page: Callable[[str, Sequence[Row], int], str],
+) -> None:
+    """The command line of a study: run what is missing and write the page.
+
+    Parameters
+    ----------
+    script: its file; words: its help; kind: the named tuple of its trials.
+    planned: the trials, of so many surveys of each kind; tried, line: as in `rows_of`.
+    page: of the command, all rows, and how many trials are still to be made.
+    """
+    parser = argparse.ArgumentParser(description=words, formatter_class=argparse.RawDescriptionHelpFormatter)
+    add_options(parser)
+    parser.add_argument("--page", type=Path, help="write the table here")
+    parser.add_argument("--seeds", type=int, default=1, help="surveys of each kind")
+    chosen = parser.parse_args()
+    rows, open_ = rows_of(chosen, planned(chosen.seeds), named(kind), tried, line)
+    if chosen.page:
+        command = f"python studies/{Path(script).name} {' '.join(sys.argv[1:])}"
+        chosen.page.write_text(page(command, rows, open_))
 
 
 def named(kind: Any) -> Callable[[Row], Any]:

@@ -72,7 +72,10 @@ def test_what_was_made_before_a_bug_is_kept(tmp_path: Path) -> None:
     assert [r["name"] for r in stored(tmp_path)] == ["a"]
 
 
-@pytest.mark.parametrize("study", ["loop_power", "leave_one_out", "level_flight", "verification", "wandering"])
+STUDIES = ["loop_power", "leave_one_out", "level_flight", "verification", "wandering", "base_station"]
+
+
+@pytest.mark.parametrize("study", STUDIES)
 def test_a_row_names_its_trial(study: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """A study that is given the rows of all its trials makes none of them again."""
     module = __import__(study)
