@@ -227,7 +227,7 @@ def test_sets_of_terms_are_scored_together_as_each_is_alone() -> None:
         joined([x.offsets(np.sin(w * t), "nT"), x.matrices(1e-4 * np.cos(w * t)[:, None] * x.field[:, 0], "1")])
         for w in (3.0, 5.0, 7.0)
     ]
-    assert several[0].like(several[2]) and not several[0].like(given)
+    assert several[0].kind == several[2].kind != given.kind
     for adopted in (None, given):
         for colours in (Colours(WHITE, WHITE), colours_of(residual)):
             score = Scorer(residual, adopted, colours)

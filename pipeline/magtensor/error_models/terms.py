@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Hashable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -81,10 +81,10 @@ class Terms:
         delay = None if self.delay is None else self.delay[samples]
         return replace(self, series=self.series[samples], delay=delay)
 
-    def like(self, other: Terms) -> bool:
-        """Whether the two differ in their series only, names and units apart."""
-        own, its = _places(self), _places(other)
-        return self.series.shape == other.series.shape and all(map(np.array_equal, own, its))
+    @property
+    def kind(self) -> Hashable:
+        """What is the same of terms that differ in their series only, names and units apart."""
+        return self.series.shape, *(place.tobytes() for place in _places(self))
 
     @property
     def adds_to_axes(self) -> bool:

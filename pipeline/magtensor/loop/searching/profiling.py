@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from math import log
 from typing import Any
@@ -198,22 +198,23 @@ def _scores(
     model: Component, grid: Sequence[dict[str, Any]], few: Thinned, failed: dict[str, str]
 ) -> tuple[list[tuple[float, float, dict[str, Any]]], list[float]]:
     """How unlikely chance explains as much in white noise and in the residual's own, for settings whose terms can be
-    made; and how alike each is to the one before."""
-    scores: list[tuple[float, float, dict[str, Any]]] = []
+    made; and how alike each is to the one before of its kind."""
+    found: dict[int, tuple[float, float]] = {}
     chain: list[float] = []
-    last: Array | None = None
-    made = ((settings, few.terms(model, settings, failed)) for settings in grid)
-    for batch in _batches((settings, terms) for settings, terms in made if terms is not None and terms.count):
+    last: dict[Hashable, Array] = {}
+    made = ((number, few.terms(model, settings, failed)) for number, settings in enumerate(grid))
+    for kind, batch in _batches((number, terms) for number, terms in made if terms is not None and terms.count):
         several = [terms for _, terms in batch]
         columns = Made.of(few.residual, several)
         both = zip(few.white.of_each(several, columns), few.coloured.of_each(several, columns), strict=True)
-        scores += [(white, coloured, settings) for (white, coloured), (settings, _) in zip(both, batch, strict=True)]
+        found |= {number: each for (number, _), each in zip(batch, both, strict=True)}
         for terms in several:
             series = projected(terms, few.freedom)
-            if last is not None:
-                chain.append(alike(last, series))
-            last = series
-    return scores, chain
+            if kind in last:
+                chain.append(alike(last[kind], series))
+            last[kind] = series
+    chain += [0.0] * (len(last) - 1)  # of different kinds nothing is known
+    return [(*found[number], grid[number]) for number in sorted(found)], chain
 
 
 def _best(scores: Sequence[tuple[float, float, dict[str, Any]]]) -> list[dict[str, Any]]:
@@ -224,13 +225,13 @@ def _best(scores: Sequence[tuple[float, float, dict[str, Any]]]) -> list[dict[st
     return [white] if white is coloured else [white, coloured]
 
 
-def _batches(made: Iterable[tuple[dict[str, Any], Terms]]) -> Iterator[list[tuple[dict[str, Any], Terms]]]:
-    """Neighbouring settings whose terms differ in their series only; so few at a time that they take little memory."""
-    batch: list[tuple[dict[str, Any], Terms]] = []
-    for settings, terms in made:
-        if batch and (len(batch) * terms.series.size > BATCH_ENTRIES or not batch[0][1].like(terms)):
-            yield batch
-            batch = []
-        batch.append((settings, terms))
-    if batch:
-        yield batch
+def _batches(made: Iterable[tuple[int, Terms]]) -> Iterator[tuple[Hashable, list[tuple[int, Terms]]]]:
+    """Numbered terms of one kind each, in their order; so few at a time that they take little memory."""
+    waiting: dict[Hashable, list[tuple[int, Terms]]] = {}
+    for number, terms in made:
+        batch = waiting.setdefault(terms.kind, [])
+        if len(batch) * terms.series.size > BATCH_ENTRIES:
+            yield terms.kind, batch
+            batch = waiting[terms.kind] = []
+        batch.append((number, terms))
+    yield from waiting.items()
