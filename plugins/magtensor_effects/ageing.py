@@ -48,7 +48,12 @@ def courses(x: Excitation, order: int, span_s: float, law: str = LAWS[0]) -> lis
     return [np.polynomial.legendre.Legendre.basis(k)(u) for k in range(1, order + 1)]
 
 
-@error_model("instrument", source="zero drift of fluxgates", typical="some nT/h after switch-on, fluxgate zero drift")
+@error_model(
+    "instrument",
+    source="zero drift of fluxgates",
+    typical="some nT/h after switch-on, fluxgate zero drift",
+    pointwise=True,
+)
 def offset_drift(x: Excitation, *, order: Order = 1, span_s: Span = 3600.0, law: Law = "time") -> Terms:
     """Each axis's offset drifts with time.
 
@@ -65,6 +70,7 @@ def offset_drift(x: Excitation, *, order: Order = 1, span_s: Span = 3600.0, law:
     "instrument",
     source="Yin and Luhr 2011 (CHAMP); Olsen et al. 2003 (Oersted)",
     typical="-79 ppm/yr (Swarm), as the logarithm of time (CHAMP) after launch",
+    pointwise=True,
 )
 def scale_drift(
     x: Excitation, *, order: Order = 1, span_s: Span = 3600.0, law: Law = "time", of_field: OfField = False
@@ -79,7 +85,7 @@ def scale_drift(
     return joined([x.scales(1e-6 * c, "ppm", f"P{k} ", of_field=of_field) for k, c in named])
 
 
-@error_model("instrument", source="exponential settling", typical="a few nT over 15 min")
+@error_model("instrument", source="exponential settling", typical="a few nT over 15 min", pointwise=True)
 def warm_up(
     x: Excitation,
     *,

@@ -20,7 +20,9 @@ ENCODER = AnyChannel("encoder*", without=ATTITUDE_ANGLES, or_units="rad", vector
 ANY = AnyChannel("*")
 
 
-@error_model("instrument", needs=("encoder*",), source="rotating dipole", typical="100 nT for 1 A m2 at 1 m")
+@error_model(
+    "instrument", needs=("encoder*",), source="rotating dipole", typical="100 nT for 1 A m2 at 1 m", pointwise=True
+)
 def moving_part(
     x: Excitation, *, channel: Annotated[str, ENCODER, Field(description="angle channel; '': the only one")] = ""
 ) -> Terms:
@@ -34,7 +36,9 @@ def moving_part(
     return joined([x.offsets(np.cos(angle), "nT", "cos "), x.offsets(np.sin(angle), "nT", "sin ")])
 
 
-@error_model("instrument", source="sampled sinusoid", typical="a nT of mains beside buildings; tens from a motor")
+@error_model(
+    "instrument", source="sampled sinusoid", typical="a nT of mains beside buildings; tens from a motor", pointwise=True
+)
 def periodic_interference(
     x: Excitation,
     *,

@@ -25,6 +25,7 @@ def _positions(x: Excitation) -> Array:
     needs=("position", "gradient"),
     source="Taylor series of the field",
     typical="1 nT for 1 mm in 1000 nT/m",
+    pointwise=True,
 )
 def position_error(x: Excitation) -> Terms:
     """A sensor's centre is not where the survey says: it sees the gradient times the offset.
@@ -61,6 +62,7 @@ def _without_common_part(each: Terms, larger: Array, shares: Array) -> Terms:
     needs=("position", "gradient", "temperature*"),
     source="thermal expansion",
     typical="23 ppm/degC for aluminium",
+    pointwise=True,
 )
 def baseline_expansion(x: Excitation, *, channel: Thermometer = "") -> Terms:
     """The frame grows with temperature about the platform's origin: each sensor sees the gradient times its shift.

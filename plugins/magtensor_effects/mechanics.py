@@ -114,6 +114,7 @@ def temperature_alignment(
     "instrument",
     source="small rotation that grows with time",
     typical="a glue that creeps, a screw that settles: arcmin, 14.5 nT each in 50 000 nT",
+    pointwise=True,
 )
 def alignment_drift(
     x: Excitation,
@@ -159,6 +160,7 @@ def _by_an_arcmin(x: Excitation, course: Array, units: str, angles: int) -> list
     needs=("position", "gradient"),
     source="dipole field of a feedback coil",
     typical="5 nT between sensors 0.25 m apart with coils of 20 mm, 75 nT at 0.1 m",
+    pointwise=True,
 )
 def crosstalk(x: Excitation) -> Terms:
     """The feedback coil of each sensor, which cancels the field there, is a dipole at the other sensors.

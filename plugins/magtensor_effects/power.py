@@ -48,7 +48,13 @@ def current_field(
     return joined([x.offsets(c, f"nT/{x.units[name]}", label) for label, c in along_a_curve(course, bends)])
 
 
-@error_model("instrument", needs=("supply*",), source="dependence of the excitation on the supply", typical="10 ppm/V")
+@error_model(
+    "instrument",
+    needs=("supply*",),
+    source="dependence of the excitation on the supply",
+    typical="10 ppm/V",
+    pointwise=True,
+)
 def supply_scale(
     x: Excitation, *, channel: Supply = "", smooth: Smooth = False, of_field: OfField = False, bends: Bent = ()
 ) -> Terms:
@@ -63,7 +69,13 @@ def supply_scale(
     return joined([x.scales(1e-6 * c, units, label, of_field=of_field) for label, c in along_a_curve(course, bends)])
 
 
-@error_model("instrument", needs=("supply*",), source="dependence of the electronics on the supply", typical="a nT/V")
+@error_model(
+    "instrument",
+    needs=("supply*",),
+    source="dependence of the electronics on the supply",
+    typical="a nT/V",
+    pointwise=True,
+)
 def supply_offset(x: Excitation, *, channel: Supply = "", smooth: Smooth = False, bends: Bent = ()) -> Terms:
     """Each axis's offset follows the supply voltage.
 

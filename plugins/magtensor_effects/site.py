@@ -42,6 +42,7 @@ def _seen(x: Excitation, world: Array) -> Array:
     needs=("attitude", "position"),
     source="linear part of a harmonic potential; site of Li et al. 2018",
     typical="10 to 100 nT/m indoors; total field +-10 nT over the site of Li 2018",
+    pointwise=True,
 )
 def site_gradient(x: Excitation) -> Terms:
     """The field at the site has a constant gradient: G R rho_i in the world frame, turned into the platform frame.
@@ -78,6 +79,7 @@ def _falls_off(x: Excitation, settings: Mapping[str, Any], coefficients: Array, 
     agrees=_falls_off,
     source="harmonic potential about the centre of the rig",
     typical="10 to 100 nT/m indoors",
+    pointwise=True,
 )
 def fixed_source(
     x: Excitation,

@@ -17,7 +17,10 @@ AT_FULL_SCALE = "nT at 50000 nT"
 
 
 @error_model(
-    "instrument", source="Olsen et al. 2020 (CryoSat-2)", typical="1 nT at 50 000 nT; CryoSat-2 3.2 nT with the cubic"
+    "instrument",
+    source="Olsen et al. 2020 (CryoSat-2)",
+    typical="1 nT at 50 000 nT; CryoSat-2 3.2 nT with the cubic",
+    pointwise=True,
 )
 def nonlinearity_quadratic(x: Excitation) -> Terms:
     """A second-order term in each axis's transfer curve: (m / 50 000 nT) squared.
@@ -28,7 +31,7 @@ def nonlinearity_quadratic(x: Excitation) -> Terms:
     return x.responses((x.output / FULL_SCALE_NT) ** 2, AT_FULL_SCALE)
 
 
-@error_model("instrument", source="Olsen et al. 2020 (CryoSat-2)", typical="1 nT at 50 000 nT")
+@error_model("instrument", source="Olsen et al. 2020 (CryoSat-2)", typical="1 nT at 50 000 nT", pointwise=True)
 def nonlinearity_cubic(x: Excitation, *, of_field: OfField = False) -> Terms:
     """A third-order term in each axis's transfer curve: (m / 50 000 nT) cubed.
 
@@ -43,6 +46,7 @@ def nonlinearity_cubic(x: Excitation, *, of_field: OfField = False) -> Terms:
     "instrument",
     source="transverse sensitivity of uncompensated fluxgates",
     typical="1 to 20 nT without vector compensation",
+    pointwise=True,
 )
 def cross_field(x: Excitation) -> Terms:
     """Each axis answers to the field across it: to the product of the two transverse outputs and to the

@@ -92,8 +92,11 @@ def gallery(content: Content) -> list[Picture | Gap]:
 
     parts: list[Callable[[], list[Picture | Gap]]] = [
         lambda: _residual_pictures(content, use),
-        lambda: [*_tensor_pictures(content), *_attitude_pictures(content, use)],
-        lambda: [*_noise_pictures(content, use), _reference(content), *_flag_pictures(content, use)],
+        lambda: _tensor_pictures(content),
+        lambda: _attitude_pictures(content, use),
+        lambda: _noise_pictures(content, use),
+        lambda: [_reference(content)],
+        lambda: _flag_pictures(content, use),
     ]
     return [shown for part in shared_out(lambda part: part(), parts) for shown in part]
 

@@ -294,7 +294,7 @@ class OwnNoise:
         parts, counts, turned = [], [], None
         rows = None if along is None else along.rows @ seen[:, :count].T
         if rows is not None and residual.along is not None:
-            turned = _course(rows[:n] / self._root_along[:, None])
+            turned = np.ascontiguousarray(_course(rows[:n] / self._root_along[:, None]).T)
             parts.append(grams_in_bands(rows[:n] * np.sqrt(self._reference / self._root_along**2)[:, None], edges))
             counts.append(each)
         if rows is not None and residual.sighted is not None:
@@ -302,16 +302,16 @@ class OwnNoise:
             parts.append((sighted.T @ sighted)[None])
             counts.append(np.array([float(len(residual.sighted.residual))]))
         if residual.across is not None:
-            of_output = np.zeros((3 * sensors, n, len(seen)))
+            of_output = np.zeros((3 * sensors, len(seen), n))
             if turned is not None:
                 for o, gain in enumerate(self._even(residual.gain).T):
-                    of_output[o] += over_frequency(turned * gain[:, None]) * self._sensors.root[:, None]
+                    of_output[o] += over_frequency(turned * gain, axis=1) * self._sensors.root
             if across is not None:
                 for (i, j), weight in zip(pairwise(edges), self._sensors.weights, strict=True):
-                    through = np.einsum("rk,sko->osr", seen, across.into @ weight, optimize=True)
-                    of_output[:, i:j] += across.series[i:j] @ through
+                    through = np.einsum("rk,sko->ors", seen, across.into @ weight, optimize=True)
+                    of_output[:, :, i:j] += through @ across.series[i:j].T
             for own, levels in zip(of_output, self._sensors.levels.T, strict=True):
-                parts.append(grams_in_bands(own, edges) * levels[:, None, None])
+                parts.append(grams_in_bands(own.T, edges) * levels[:, None, None])
                 counts.append(each * (sensors - 1) / sensors)
         return np.concatenate(parts), np.concatenate(counts)
 

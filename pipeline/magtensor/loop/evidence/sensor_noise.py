@@ -195,11 +195,11 @@ def grams_in_bands(columns: Array, edges: NDArray[np.int_]) -> Array:
     return np.stack([columns[i:j].T @ columns[i:j] for i, j in pairwise(edges)])
 
 
-def over_frequency(series: Array) -> Array:
-    """The cosine transform of series (N, ...), of which noise has independent values."""
+def over_frequency(series: Array, axis: int = 0) -> Array:
+    """The cosine transform of series (N, ...), or with N along another axis, of which noise has independent values."""
     from scipy.fft import dct
 
-    out: Array = dct(series, axis=0, norm="ortho")
+    out: Array = dct(series, axis=axis, norm="ortho")
     return out
 
 

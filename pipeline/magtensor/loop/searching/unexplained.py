@@ -32,6 +32,7 @@ from magtensor.loop.searching.found import Search
 from magtensor.loop.searching.gates import SECOND_ORDER, Candidate
 from magtensor.loop.searching.keeping import NOT_AS_ASSUMED
 from magtensor.loop.searching.latent import shared_words
+from magtensor.sharing import shared_out
 
 ALPHA = 0.001  # of each of the tests
 OF_A_LINE = 0.1  # of the square of what is left above the noise: less than that says nothing of its cause
@@ -72,11 +73,13 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
         turning = of_the_turning(state.excitation, line[:1], line[1:])[0]
         too = ", where the platform's turning has one too" if turning else ""
         words.append(f"a line at {line[0]:.4g} Hz (period {1 / line[0]:.4g} s), {line[1]:.3g} nT rms{too}")
-    following = attitude_words(state)
+    following, changing = shared_out(
+        lambda of: of(state), [attitude_words, lambda state: [m.words for m in changing_matrices(state, ALPHA)]]
+    )
     words.extend(following or converter_words(state))
     words.extend(shortened_words(state))
     words.extend(jitter_words(state))
-    words.extend(one.words for one in changing_matrices(state, ALPHA))
+    words.extend(changing)
     noise = float(np.hypot(OwnNoise(state.residual, None).slow_along(), of_the_station(state, record)))
     noise = float(np.hypot(noise, sparse.between if sparse is not None else 0.0))
     if (slow := slow_along(state)) > max(MUCH * state.residual.scale, TWICE * noise):
