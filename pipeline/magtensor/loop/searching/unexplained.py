@@ -54,9 +54,11 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
         seen = tuple(c for c in seen if _still_significant(c, state))
     refused = found.steps[-1].refused if found.steps else {}
     sparse = sparse_readings(state, record)
-    # what lies between the readings looks like an error of theirs, and so does their noise
-    reference = {c.model.name for c in last if c.model.component.effect == "reference"}
-    noisy = reference if sparse is not None else {n for n in reference if refused.get(n) == NOT_AS_ASSUMED}
+    # the noise of the readings looks like an error of theirs, and so does what lies between them
+    reference = [c for c in last if c.model.component.effect == "reference"]
+    noisy = {c.model.name for c in reference if refused.get(c.model.name) == NOT_AS_ASSUMED}
+    if sparse is not None:
+        noisy |= {c.model.name for c in reference if not c.passes}
     of_the_noise = [c.model.name for c in seen if c.model.name in noisy]
     seen = tuple(c for c in seen if c.model.name not in noisy)
     if sparse is not None:
