@@ -33,7 +33,8 @@ from magtensor.loop.remainder.predictable import (
 )
 from magtensor.loop.searching.contribution import happens_once, slices
 from magtensor.loop.searching.found import Search, without_and_with
-from magtensor.loop.searching.unexplained import unexplained, unlikely
+from magtensor.loop.searching.suspects import unlikely
+from magtensor.loop.searching.unexplained import unexplained
 
 NAMELESS = 2.0  # times what stays, that a response to a logged vector explains if it is the law
 ALONG = 0.95  # cosine, with a source's vector or another event's; of one sensor 5 % of all directions are as near

@@ -7,13 +7,11 @@ sensor whose matrix is not constant, or an error model that is significant and w
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from magtensor.loop.evidence.assessment import assess
 from magtensor.loop.evidence.own_noise import OwnNoise
 from magtensor.loop.evidence.residual import residual_of
 from magtensor.loop.evidence.spectrum import spectral_lines
@@ -25,13 +23,11 @@ from magtensor.loop.remainder.flagged import beyond_the_reference, flagged_words
 from magtensor.loop.remainder.gradient_shape import MODEL, gradient_share
 from magtensor.loop.remainder.jitter import jitter_words
 from magtensor.loop.remainder.predictable import attitude_words, converter_words, shortened_words
-from magtensor.loop.remainder.sparse_readings import sparse_readings
+from magtensor.loop.remainder.sparse_readings import SparseReadings, sparse_readings
 from magtensor.loop.remainder.tones import of_the_turning
-from magtensor.loop.searching.contribution import happens_once
 from magtensor.loop.searching.found import Search
-from magtensor.loop.searching.gates import SECOND_ORDER, Candidate
-from magtensor.loop.searching.keeping import NOT_AS_ASSUMED
 from magtensor.loop.searching.latent import shared_words
+from magtensor.loop.searching.suspects import Suspects
 from magtensor.sharing import shared_out
 
 ALPHA = 0.001  # of each of the tests
@@ -47,24 +43,41 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
     """The `unexplained` block of the contract."""
     state = found.told
     excess = excess_rms(state)
-    last = found.steps[-1].candidates if found.steps else ()
-    seen = tuple(c for c in last if c.passes or unlikely(c))
-    flagged = lasting(disturbed(record, state, found.how), beyond_the_reference(state, record))
-    if flagged.any():  # while effects were sought, what lasts was believed
-        seen = tuple(c for c in seen if _still_significant(c, state))
-    refused = found.steps[-1].refused if found.steps else {}
     sparse = sparse_readings(state, record)
-    # the noise of the readings looks like an error of theirs, and so does what lies between them
-    reference = [c for c in last if c.model.component.effect == "reference"]
-    noisy = {c.model.name for c in reference if refused.get(c.model.name) == NOT_AS_ASSUMED}
-    if sparse is not None:
-        noisy |= {c.model.name for c in reference if not c.passes}
-    of_the_noise = [c.model.name for c in seen if c.model.name in noisy]
-    seen = tuple(c for c in seen if c.model.name not in noisy)
-    if sparse is not None:
-        last = tuple(c for c in last if c.model.name not in noisy)
-    suspects = [c for c in seen if not (c.of_the_log or c.of_second_order or c.of_the_law)]
-    words: list[str] = []
+    flagged = lasting(disturbed(record, state, found.how), beyond_the_reference(state, record))
+    suspects = Suspects.of(found, flagged, sparse)
+    words = [*_what_shows(found, record, excess, sparse), *suspects.words]
+    beside = [*loud_words(state, record, found.how), *unread_words(state, record)]
+    gradient = gradient_share(state, record.position)
+    shaped = bool(words) and gradient > 0
+    if shaped:
+        lacks = " and ".join(found.not_tested.get(MODEL, ()))
+        words.append(
+            f"{gradient:.0%} of what differs between the sensors has the shape of a uniform gradient of the field"
+            + (f": {MODEL}, which cannot be tested without {lacks}, would look like this" if lacks else "")
+        )
+    if words:
+        in_use = " at the samples in use" if flagged.mean() > MANY_FLAGGED else ""
+        size = f"{excess:.3g} nT rms above the white noise{in_use}, {_where(state)}"
+        words.insert(0, size if excess else "in sum no more than the white noise")
+    beside += [sparse.words] if sparse is not None else suspects.noise_words
+    beside += suspects.small_words
+    if flagged.any():
+        left_out, noise = flagged_words(flagged, state, record, sparse)
+        (beside if noise else words).append(left_out)
+    present = bool(words)
+    untested = [MODEL] if shaped and MODEL in found.not_tested else []
+    return {
+        "present": present,
+        "excess_rms_nT": excess,
+        "description": "; ".join([*(words if present else noise_words(state, record)), *beside]),
+        "looks_like": untested + suspects.nearest if present else [],
+    }
+
+
+def _what_shows(found: Search, record: Record, excess: float, sparse: SparseReadings | None) -> list[str]:
+    """What no noise makes of what is left, whatever model may explain it."""
+    state, words = found.told, []
     shared = found.shared
     # noise that grows louder makes a small one by chance, which predicts nothing
     if shared is not None and shared.significant and (shared.gain.consistent or shared.share > OF_A_LINE):
@@ -89,52 +102,7 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
             f"{slow:.3g} nT rms of |b| - F, in all sensors alike, is no white noise: an error of the base station, or "
             "a field at the site that it does not see"
         )
-    gradient = gradient_share(state, record.position)
-    if open_ := [c.model.name for c in suspects if c.passes]:
-        named = [f"{name} ({refused[name]})" if name in refused else name for name in open_]
-        words.append(f"significant, passes the first two gates of the loop and is not adopted: {', '.join(named)}")
-    if useless := [c.model.name for c in suspects if not c.passes]:
-        words.append(f"significant but of no use on held-out blocks: {', '.join(useless)}")
-    shaped = bool(words) and gradient > 0
-    if shaped:
-        lacks = " and ".join(found.not_tested.get(MODEL, ()))
-        words.append(
-            f"{gradient:.0%} of what differs between the sensors has the shape of a uniform gradient of the field"
-            + (f": {MODEL}, which cannot be tested without {lacks}, would look like this" if lacks else "")
-        )
-    if words:
-        in_use = " at the samples in use" if flagged.mean() > MANY_FLAGGED else ""
-        size = f"{excess:.3g} nT rms above the white noise{in_use}, {_where(state)}"
-        words.insert(0, size if excess else "in sum no more than the white noise")
-    beside = loud_words(state, record, found.how) + unread_words(state, record)
-    if sparse is not None:
-        beside.append(sparse.words)
-    elif of_the_noise:
-        beside.append(
-            f"{' and '.join(of_the_noise)}: significant, but as noise of the base station, or the field between its "
-            "readings, would make it"
-        )
-    if small := [c.model.name for c in seen if c.of_second_order]:
-        beside.append(
-            f"{' and '.join(small)}: significant, and less than {SECOND_ORDER**0.5:.1%} of the size of what is "
-            "adopted, whose law may miss as much"
-        )
-    if flagged.any():
-        left_out, noise = flagged_words(flagged, state, record, sparse)
-        (beside if noise else words).append(left_out)
-    present = bool(words)
-    untested = [MODEL] if shaped and MODEL in found.not_tested else []
-    return {
-        "present": present,
-        "excess_rms_nT": excess,
-        "description": "; ".join([*(words if present else noise_words(state, record)), *beside]),
-        "looks_like": untested + _looks_like(last) if present else [],
-    }
-
-
-def unlikely(candidate: Candidate) -> bool:
-    """Whether no noise explains a model, whatever it predicts."""
-    return max(candidate.adjusted_p, candidate.adjusted_own_p) < candidate.alpha and candidate.adjusted_null_p < ALPHA
+    return words
 
 
 def noise_words(state: State, record: Record) -> list[str]:
@@ -220,17 +188,6 @@ def excess_rms(state: State) -> float:
     return float(np.sqrt(max(state.residual.square() - 1.0, 0.0)) * state.residual.scale)
 
 
-def _still_significant(candidate: Candidate, state: State) -> bool:
-    """Whether a model is asked for by the samples that are still in use."""
-    from magtensor.loop.evidence.grams import Whitened
-
-    terms = candidate.model.terms(state.excitation).at(state.residual.samples)
-    white = Whitened.of(state.residual, state.colours.across, state.colours.along, state.terms)
-    now = assess(white, terms, once=happens_once(candidate.model))
-    p = max(now.p, now.own_p)
-    return p * candidate.tried < candidate.alpha and now.null_p * candidate.tried < ALPHA
-
-
 def strongest_line(state: State, record: Record) -> tuple[float, float] | None:
     """Frequency in Hz and rms in nT of a spectral line that noise does not make; None without one."""
     lines = spectral_lines(state.residual, record.time[state.residual.samples])
@@ -260,9 +217,3 @@ def _on_sensors(state: State) -> str:
     if len(top) == len(each):
         return "on all sensors"
     return f"mostly on {', '.join(state.excitation.sensors[i] for i in sorted(top))}"
-
-
-def _looks_like(candidates: Sequence[Candidate]) -> list[str]:
-    """The models that come nearest to explaining it, most significant first."""
-    near = sorted((c for c in candidates if c.adjusted_p < 0.05), key=lambda c: c.adjusted_p)
-    return [c.model.name for c in near[:5]]

@@ -1,0 +1,115 @@
+"""Which error models the end of a search leaves under suspicion: significant ones that were not adopted."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from magtensor.calibration.types import Mask
+from magtensor.loop.evidence.assessment import assess
+from magtensor.loop.evidence.grams import Whitened
+from magtensor.loop.fitting.model import State
+from magtensor.loop.remainder.sparse_readings import SparseReadings
+from magtensor.loop.searching.contribution import happens_once
+from magtensor.loop.searching.found import Search
+from magtensor.loop.searching.gates import SECOND_ORDER, Candidate
+from magtensor.loop.searching.keeping import NOT_AS_ASSUMED
+
+ALPHA = 0.001  # of noise that explains a model, whatever the model predicts
+NEAR = 0.05  # corrected p value of what is said to come near
+MOST_NEAREST = 5
+
+
+@dataclass(frozen=True)
+class Suspects:
+    """What the candidates of the last round say of what is left: names of models.
+
+    Attributes:
+        open: those that pass the first two gates and were refused, with the reason; useless: significant ones that do
+            not pass.
+        small: so small beside what is adopted that its law may miss as much.
+        noise: of the base station, whose noise, or the field between its readings, looks like them.
+        nearest: those that come nearest to explaining it, most significant first.
+    """
+
+    open: list[str]
+    useless: list[str]
+    small: list[str]
+    noise: list[str]
+    nearest: list[str]
+
+    @classmethod
+    def of(cls, found: Search, flagged: Mask, sparse: SparseReadings | None) -> Suspects:
+        """Of a search that has ended.
+
+        Parameters
+        ----------
+        flagged: (N,) samples that no calibration fits.
+        """
+        last = found.steps[-1].candidates if found.steps else ()
+        refused = found.steps[-1].refused if found.steps else {}
+        seen = [c for c in last if c.passes or unlikely(c)]
+        if flagged.any():  # while effects were sought, what lasts was believed
+            seen = [c for c in seen if _still_significant(c, found.told)]
+        reference = [c for c in last if c.model.component.effect == "reference"]
+        noisy = {c.model.name for c in reference if refused.get(c.model.name) == NOT_AS_ASSUMED}
+        if sparse is not None:
+            noisy |= {c.model.name for c in reference if not c.passes}
+        suspects = [
+            c for c in seen
+            if c.model.name not in noisy and not (c.of_the_log or c.of_second_order or c.of_the_law)
+        ]  # fmt: skip
+        open_ = [c.model.name for c in suspects if c.passes]
+        near = sorted((c for c in last if c.adjusted_p < NEAR), key=lambda c: c.adjusted_p)
+        return cls(
+            [f"{name} ({refused[name]})" if name in refused else name for name in open_],
+            [c.model.name for c in suspects if not c.passes],
+            [c.model.name for c in seen if c.model.name not in noisy and c.of_second_order],
+            [c.model.name for c in seen if c.model.name in noisy],
+            [c.model.name for c in near if sparse is None or c.model.name not in noisy][:MOST_NEAREST],
+        )
+
+    @property
+    def words(self) -> list[str]:
+        """Those that make something unexplained."""
+        words = []
+        if self.open:
+            words.append(
+                f"significant, passes the first two gates of the loop and is not adopted: {', '.join(self.open)}"
+            )
+        if self.useless:
+            words.append(f"significant but of no use on held-out blocks: {', '.join(self.useless)}")
+        return words
+
+    @property
+    def noise_words(self) -> list[str]:
+        """Those that the noise of the base station makes."""
+        if not self.noise:
+            return []
+        return [
+            f"{' and '.join(self.noise)}: significant, but as noise of the base station, or the field between its "
+            "readings, would make it"
+        ]
+
+    @property
+    def small_words(self) -> list[str]:
+        """Those that the law of what is adopted may leave."""
+        if not self.small:
+            return []
+        return [
+            f"{' and '.join(self.small)}: significant, and less than {SECOND_ORDER**0.5:.1%} of the size of what is "
+            "adopted, whose law may miss as much"
+        ]
+
+
+def unlikely(candidate: Candidate) -> bool:
+    """Whether no noise explains a model, whatever it predicts."""
+    return max(candidate.adjusted_p, candidate.adjusted_own_p) < candidate.alpha and candidate.adjusted_null_p < ALPHA
+
+
+def _still_significant(candidate: Candidate, state: State) -> bool:
+    """Whether a model is asked for by the samples that are still in use."""
+    terms = candidate.model.terms(state.excitation).at(state.residual.samples)
+    white = Whitened.of(state.residual, state.colours.across, state.colours.along, state.terms)
+    now = assess(white, terms, once=happens_once(candidate.model))
+    p = max(now.p, now.own_p)
+    return p * candidate.tried < candidate.alpha and now.null_p * candidate.tried < ALPHA
