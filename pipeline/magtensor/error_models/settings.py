@@ -29,7 +29,8 @@ class Range:
         spacing: "linear" or "log" (with 0 added in front where `low` is 0, and where it is below 0 the same on the
             other side, beyond `count`, up to a fifth of the survey: a log that is late tells nothing of the end).
         of_duration: the limits are fractions of the survey's duration.
-        sampled: nothing shorter than the time between samples is tried, which no sample would show.
+        sampled: nothing shorter than the time between samples, which no sample would show, is tried or kept; where the
+            field turns too fast between them to be known there, nothing shorter than twice that.
         late: below 0 the log of what is followed comes so much too late as a whole, in whatever form it is followed;
             such delays are no part of the grid, but found from the residual.
     """
@@ -48,8 +49,13 @@ class Range:
 
     def values(self, x: Excitation) -> list[Any]:
         """The grid for a survey."""
-        least = x.spacing if self.sampled else -np.inf
-        return [v for v in self._grid(x) if v >= least]
+        return [v for v in self._grid(x) if v >= self.least(x)]
+
+    def least(self, x: Excitation) -> float:
+        """The least value that the samples of a survey can show."""
+        if not self.sampled:
+            return -np.inf
+        return x.spacing if x.turns else 2.0 * x.spacing
 
     def _grid(self, x: Excitation) -> list[float]:
         low, high = (self.low * x.duration, self.high * x.duration) if self.of_duration else (self.low, self.high)

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from magtensor.error_models.excitation import Excitation
+from magtensor.error_models.settings import Range, profiled
 from magtensor.errors import DataError
 from magtensor.loop.fitting.log_noise import channels_of
-from magtensor.loop.fitting.model import Fitting, Record
+from magtensor.loop.fitting.model import Adopted, Fitting, Record
 from magtensor.loop.fitting.trial import Trial, on_the_folds_of, trial
 from magtensor.loop.remainder.changing_matrix import channel_instead
 from magtensor.loop.remainder.curve_of_a_channel import event_of_a_curve
@@ -85,6 +87,8 @@ def why_not(before: Trial, after: Trial, chosen: Candidate, how: Fitting) -> str
         return "fitted, it lags by more than half of the survey: any drift would do as well"
     if at_its_limit(model.component, model.settings, x):
         return "fitted, it would have begun as far from what it follows as is possible: something else dies away"
+    if shorter := _shorter_than_shown(model, x):
+        return f"fitted, its {shorter} is shorter than the samples can show: something quicker would do as well"
     if not agrees(after.state, which):
         return NOT_AS_ASSUMED
     if (share := share_of_differences(after.state, which)) > MOST_OF_DIFFERENCES:
@@ -105,3 +109,10 @@ def why_not(before: Trial, after: Trial, chosen: Candidate, how: Fitting) -> str
         if channel := channel_instead(seen, terms, chosen.assessment.colours):
             return f"C of {', '.join(acts_on)} follows {channel}, which explains more than something that happens once"
     return ""
+
+
+def _shorter_than_shown(model: Adopted, x: Excitation) -> str:
+    """The time constant of a model that is shorter than a survey's samples can show; "" if none is."""
+    grids = profiled(model.component)
+    ranges = ((name, grid) for name, grid in grids.items() if isinstance(grid, Range) and name in model.settings)
+    return next((name for name, grid in ranges if model.settings[name] < grid.least(x)), "")

@@ -27,6 +27,7 @@ from magtensor.loop.searching.profiling import repeatable
 from magtensor.loop.searching.rivals import containing, overlaps, part_of, part_of_a_drift, simplest
 from magtensor.loop.searching.screening import candidates_of
 from magtensor.loop.searching.split import split
+from magtensor.loop.searching.unknown_rate import rate_instead
 from magtensor.loop.searching.which_channel import nearest
 
 MOST_OF_A_SAMPLE = 50.0  # log likelihood: half of the largest squared residual of a sample that noise may explain
@@ -189,6 +190,9 @@ class Rounds:
                 if channel not in asked:
                     asked.add(channel)
                     left += by_any_law_of(channel, before.state, self.open_models(before.state), self.alpha)
+                continue
+            if name := rate_instead(chosen, before.state, self.models):
+                refuse(chosen.model.name, f"{name}, for which the field turns too fast between samples, explains more")
                 continue
             if not time.seen:
                 rivals = tuple(sorted({*rivals, *rivals_in_time(chosen, possible, before.state)}))

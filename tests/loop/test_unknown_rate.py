@@ -1,0 +1,49 @@
+"""What turns with the field faster than it is sampled is called no other thing that remembers the field."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from loop_cases import adopted_names, linear_state, loaded, scenario, verdict_of
+
+from magtensor.error_models.settings import Range
+from magtensor.loop.searching.unknown_rate import of_the_rate
+from magtensor.registry import Registry
+
+REMEMBERS = ["hysteresis", "viscous_magnetisation"]
+OF_THE_RATE = ["sampling_lag", "bandwidth", "eddy_current", "clock_drift"]
+QUICK = {"type": "tumbling", "duration_s": 900.0, "rate_rms_deg_s": 60.0, "rate_time_s": 1.0}  # 30 deg between samples
+
+
+@pytest.mark.parametrize("effect", [pytest.param("sampling_lag", marks=pytest.mark.long), "bandwidth", "eddy_current"])
+def test_a_delay_where_the_rate_is_not_known_is_told(effect: str, tmp_path: Path) -> None:
+    survey = scenario(4, {"type": effect, "rms_nT": 1.5}, motion=QUICK)
+    found = verdict_of(tmp_path, survey, models=[*REMEMBERS, *OF_THE_RATE])
+    assert not adopted_names(found)
+    assert found["unexplained"]["present"]
+    assert {n["error_model"] for n in found["not_tested"]} == set(OF_THE_RATE)
+    refused = found["steps"][-1]["refused"]
+    assert any("for which the field turns too fast between samples, explains more" in refused[n] for n in REMEMBERS)
+
+
+@pytest.mark.parametrize("seed", [4, pytest.param(5, marks=pytest.mark.long)])
+def test_what_remembers_the_field_is_found_all_the_same(seed: int, tmp_path: Path) -> None:
+    survey = scenario(seed, {"type": "hysteresis", "rms_nT": 1.5}, motion=QUICK)
+    assert adopted_names(verdict_of(tmp_path, survey, models=[*REMEMBERS, *OF_THE_RATE])) == {"hysteresis"}
+
+
+def test_a_time_constant_is_no_shorter_than_the_samples_show(tmp_path: Path) -> None:
+    """Where the rate of change is not known the field between two samples is not, either."""
+    models = [Registry.load().find("error_model", name) for name in [*REMEMBERS, *OF_THE_RATE]]
+    known, unknown = (
+        linear_state(loaded(tmp_path, scenario(4, motion={**QUICK, "rate_rms_deg_s": rate}))).excitation
+        for rate in (10.0, 60.0)
+    )
+    assert (known.turns, unknown.turns) == (True, False)
+    assert not of_the_rate(known, models)
+    assert [m.name for m in of_the_rate(unknown, models)] == OF_THE_RATE
+    grid = Range(0.1, 100.0, count=7, spacing="log", sampled=True)
+    assert min(grid.values(known)) >= grid.least(known) == known.spacing
+    assert min(grid.values(unknown)) >= grid.least(unknown) == 2.0 * unknown.spacing
+    assert Range(0.1, 100.0).least(unknown) < 0.1
