@@ -169,19 +169,39 @@ def frequencies(series: Array) -> Array:
     return out
 
 
+def with_gap(seed: int, first: int, end: int, added: Array | None = None) -> State:
+    """A survey that lacks the samples from one to before another."""
+    record = synthetic(seed, SAMPLES, turning_s=4.0, noise_nT=0.15, added=added)
+    here = np.flatnonzero((np.arange(SAMPLES) < first) | (np.arange(SAMPLES) >= end))
+    assert record.total_field is not None and record.quiet_field is not None
+    return linear_state(
+        replace(
+            record, time=record.time[here], raw=record.raw[here],
+            total_field=record.total_field[here], quiet_field=record.quiet_field[here],
+        )
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("slow", [{}, {0: 0.1, 1: 0.1, 2: 0.1, 3: 0.1}])
+def test_a_jump_beside_a_gap_is_no_likelier_than_elsewhere(slow: dict[int, float]) -> None:
+    """The last sample before a gap and the first after it have noise, which does not go on through the gap."""
+    offset_step = Registry.load().find("error_model", "offset_step")
+    p = []
+    for seed in range(230, 242):
+        state = with_gap(seed, 600, 900, noisy(seed, slow, 60.0))
+        noise = OwnNoise(state.residual, None)
+        for time_s in (200.0, 595.0, 598.0, 901.0, 905.0):
+            p.append(noise.p_value(offset_step.function(state.excitation, time_s=time_s).at(state.residual.samples)))
+    assert min(p) > 1e-3
+    assert np.mean(np.array(p) < 0.01) < 0.1
+
+
 def test_slow_noise_goes_on_in_a_gap() -> None:
     """Half an hour is missing while an axis walks on: no jump that its own spectrum could not make."""
     offset_step = Registry.load().find("error_model", "offset_step")
     p = []
     for seed in range(200, 206):
-        record = synthetic(seed, SAMPLES, turning_s=4.0, noise_nT=0.15, added=noisy(seed, {2: 3.0}, 3000.0, 1, 2))
-        here = np.flatnonzero((np.arange(SAMPLES) < 700) | (np.arange(SAMPLES) >= 1000))
-        assert record.total_field is not None and record.quiet_field is not None
-        record = replace(
-            record, time=record.time[here], raw=record.raw[here],
-            total_field=record.total_field[here], quiet_field=record.quiet_field[here],
-        )  # fmt: skip
-        state = linear_state(record)
+        state = with_gap(seed, 700, 1000, noisy(seed, {2: 3.0}, 3000.0, 1, 2))
         terms = offset_step.function(state.excitation, time_s=850.0).at(state.residual.samples)
         p.append([OwnNoise(r, None).p_value(terms) for r in (state.residual, replace(state.residual, time=None))])
     over_time, as_if_no_gap = np.array(p).T

@@ -20,11 +20,11 @@ import numpy as np
 from magtensor.calibration.types import Array
 from magtensor.error_models.terms import REFERENCE, Terms, joined
 from magtensor.loop.evidence.columns import across_directions, along_the_field
+from magtensor.loop.evidence.even_rate import EvenRate
 from magtensor.loop.evidence.one_series import one_series_p
 from magtensor.loop.evidence.other_times import as_at_other_times
 from magtensor.loop.evidence.residual import Residual, taken_off
 from magtensor.loop.evidence.sensor_noise import (
-    LEAST,
     SensorNoise,
     bands,
     grams_in_bands,
@@ -41,7 +41,6 @@ from magtensor.loop.evidence.statistics import (
     identifiable,
 )
 
-MOST_MISSING = 0.25  # of the samples: longer gaps are shortened to that
 NOT_ASKED = 0.05  # p value, from which on nobody asks how likely it is
 LEAST_RESOLVED = 8  # frequencies, of the shortest surveys
 _INNER_RANK = 1e-6  # of the largest singular value
@@ -326,30 +325,12 @@ class OwnNoise:
         return max(int(count / max(a_reading, 1.0)), LEAST_RESOLVED)
 
     @cached_property
-    def _between(self) -> Array | None:
-        """(M,) numbers of samples, and where some are missing places between two of them; None where none are."""
-        time = self.residual.time
-        if time is None or len(time) < LEAST:
-            return None
-        steps = np.diff(time)
-        missing = np.maximum(np.round(steps / np.median(steps)) - 1.0, 0.0)
-        if not missing.any():
-            return None
-        missing = np.floor(missing * min(1.0, MOST_MISSING * len(time) / missing.sum())).astype(int)
-        places = [i + np.arange(more + 1) / (more + 1) for i, more in enumerate(missing)]
-        return np.concatenate([*places, [len(time) - 1.0]])
+    def _rate(self) -> EvenRate | None:
+        return EvenRate.of(self.residual.time)
 
     def _even(self, series: Array) -> Array:
-        """(M,) or (M, K): the values (N,) or (N, K) at an even rate, straight lines across gaps.
-
-        Slow noise goes on in a gap, and would seem to have jumped if what comes after it followed at once.
-        """
-        if self._between is None:
-            return series
-        before = np.minimum(self._between.astype(int), len(series) - 2)
-        part = (self._between - before).reshape(-1, *(1,) * (series.ndim - 1))
-        out: Array = series[before] * (1.0 - part) + series[before + 1] * part
-        return out
+        """(M,) or (M, K): the values (N,) or (N, K) at an even rate."""
+        return series if self._rate is None else self._rate(series)
 
     @cached_property
     def _sensors(self) -> SensorNoise:
