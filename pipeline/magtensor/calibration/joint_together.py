@@ -20,6 +20,7 @@ from .whole_record import Limits
 
 FALSE_REJECTION = 0.01  # probability that one clean sample of the whole survey is rejected
 LEAST_FOR_REJECTION = 50  # with fewer samples the fit bends to an outlier, and no residual can tell which it was
+ABOUT = 25  # samples that a sample lies among
 _TOLD_APART = 2  # rounds after which the noise of two sensors no longer moves
 
 
@@ -72,7 +73,7 @@ def fit_together(
             break
         squares = _squared_residuals(plane, scalar, part, reference_noise)
         limits = limits_from(squares, len(plane.noise) - 3, len(raw))
-        again = (squares[0] <= limits.along) & (squares[1] <= limits.across)
+        again = ~among_their_like((squares[0] > limits.along) | (squares[1] > limits.across))
         if np.array_equal(again, keep):
             break
         if again.sum() < 0.5 * len(raw):
@@ -86,6 +87,16 @@ def fit_together(
             if two:
                 given = told_apart(given, unfolded(plane, scalar), raw, total_field)
     return Found(plane, scalar, keep)
+
+
+def among_their_like(doubted: Mask) -> Mask:
+    """(N,) doubted samples, and others that most of those about them are: a sensor that is wrong for a while comes near
+    what is right now and then, and what is then believed of it spoils the fit."""
+    from scipy.ndimage import median_filter
+
+    if np.count_nonzero(doubted) <= ABOUT // 2:
+        return doubted
+    return doubted | median_filter(doubted.astype(np.uint8), size=ABOUT, mode="nearest").astype(bool)
 
 
 def unfolded(plane: CommonField, scalar: ScalarFit) -> tuple[Array, Array]:

@@ -14,17 +14,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from magtensor.calibration.joint import JointFit
-from magtensor.calibration.joint_together import FALSE_REJECTION
+from magtensor.calibration.joint_together import ABOUT, FALSE_REJECTION, among_their_like
 from magtensor.calibration.types import Array, Mask
 from magtensor.loop.evidence.folds import FOLDS
 from magtensor.loop.evidence.residual import residual_of
 
-ABOUT = 25  # samples whose median roughness tells how loud the noise is: a dozen that are disturbed do not
 NEIGHBOURS = 5  # samples of a running median: what lasts for three of them is no spike
+MOSTLY = 2 / 3  # of a stretch that a fit doubts, if it is louder
 LEAST_LOUD = 50  # samples: of fewer nobody knows how loud they are
 LIMITS = 40  # of the loudness, tried
 WORTH_IT = 0.5  # of the variance of a calibration from all samples is left, where some are left out for it
@@ -102,7 +104,7 @@ def too_loud_in(values: Array, affine: Array, effects: Sequence[Array] = ()) -> 
     if not found[best] <= WORTH_IT * found[-1]:
         return out
     loud = median_filter((level > limits[best]).astype(int), size=ABOUT, mode="nearest")
-    for first, end in np.flatnonzero(np.diff(loud, prepend=0, append=0)).reshape(-1, 2):
+    for first, end in _runs(loud):
         out[first:end] = end - first >= LEAST_LOUD
     for square in effects:
         if level[~out] @ square[~out] * square.sum() ** 2 > level @ square * square[~out].sum() ** 2:
@@ -114,7 +116,8 @@ def louder_in(keep: Mask, parts: Sequence[tuple[int, Array]]) -> Mask:
     """The same of a fit that keeps some of its samples (N,); the parameters are those of `borne_out_in`.
 
     Noise is what differs from one sample to the next. A spike's neighbours have no more of it than others, and what
-    passes by is smooth: neither is taken for noise.
+    passes by is smooth: neither is taken for noise. What is wrong for a while comes near what is right now and then: of
+    a stretch of which the fit doubts most, most is louder or nothing is believed.
     """
     from scipy.ndimage import median_filter
     from scipy.special import chdtri
@@ -127,7 +130,11 @@ def louder_in(keep: Mask, parts: Sequence[tuple[int, Array]]) -> Mask:
         level = median_filter(its, size=ABOUT, mode="mirror")
         limit = chdtri(freedom, FALSE_REJECTION / (count * len(parts))) / chdtri(freedom, 0.5)
         good &= own <= limit * np.maximum(level, np.median(its))
-    return keep | good
+    out = keep | good
+    for first, end in _runs(among_their_like(~keep)):
+        if end - first > ABOUT and np.mean(out[first:end]) < MOSTLY:
+            out[first:end] = False
+    return out
 
 
 def _parts(fit: JointFit, raw: Array, total_field: Array, reference_noise: float) -> list[tuple[int, Array]]:
@@ -158,9 +165,13 @@ def borne_out_in(keep: Mask, parts: Sequence[tuple[int, Array]]) -> Mask:
         limit = chdtri(freedom, FALSE_REJECTION / (count * len(parts))) / chdtri(freedom, 0.5)
         good &= square <= limit * np.median(square)
     out = keep | good
-    doubtful = median_filter((~keep).astype(int), size=NEIGHBOURS, mode="nearest")
-    edges = np.flatnonzero(np.diff(doubtful, prepend=0, append=0)).reshape(-1, 2)
-    for first, end in edges:
+    doubtful = median_filter((~keep).astype(np.uint8), size=NEIGHBOURS, mode="nearest")
+    for first, end in _runs(doubtful):
         if end - first > count / FOLDS:
             out[first:end] = True
     return out
+
+
+def _runs(some: NDArray[Any]) -> NDArray[np.int_]:
+    """(K, 2) where each run of some samples (N,) begins and ends."""
+    return np.flatnonzero(np.diff(some.astype(int), prepend=0, append=0)).reshape(-1, 2)

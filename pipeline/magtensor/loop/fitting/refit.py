@@ -232,6 +232,11 @@ def disturbed(record: Record, state: State, how: Fitting) -> NDArray[np.bool_]:
     return out & (how.among(record.time) | ~louder(state.fit, raw, reference, how.reference_noise))
 
 
+def settled(record: Record, state: State, how: Fitting) -> State:
+    """The fit at the end of a search: what nothing explains is a disturbance after all, and no part of it."""
+    return joint_state(record, state.adopted, replace(how, searching=False), state.theta, state.lines)
+
+
 def reweighed(record: Record, state: State, how: Fitting) -> State:
     """The state with C and o fitted as `how` says, its coefficients and the samples that it believes as they are."""
     each = [a.terms(state.excitation) for a in state.adopted]

@@ -21,12 +21,13 @@ AT_AN_END = 0.95  # of the other samples have smaller, or larger, values on aver
 FAR = 3.0  # times the rms of slow noise: where it wanders furthest it stays for a while
 
 
-def lasting(bad: Mask, excused: Mask | None = None) -> Mask:
-    """(N,) samples in runs of bad ones that are longer than a spike and its neighbour and hold none that is excused."""
+def lasting(bad: Mask, excused: Mask | None = None, longest: int = LONGEST_SPIKE) -> Mask:
+    """(N,) samples in runs of bad ones that are longer than a spike and its neighbour, or so many samples, and hold
+    none that is excused."""
     out = np.zeros(len(bad), dtype=bool)
     edges = np.flatnonzero(np.diff(np.concatenate(([0], bad.astype(int), [0]))))
     for start, stop in zip(edges[0::2], edges[1::2], strict=True):
-        out[start:stop] = stop - start > LONGEST_SPIKE and (excused is None or not excused[start:stop].any())
+        out[start:stop] = stop - start > longest and (excused is None or not excused[start:stop].any())
     return out
 
 

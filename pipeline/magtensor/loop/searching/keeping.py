@@ -22,6 +22,7 @@ from magtensor.loop.searching.contribution import (
     share_of_the_field,
 )
 from magtensor.loop.searching.gates import Candidate
+from magtensor.loop.searching.left_out import better_left_out
 from magtensor.loop.searching.likeness import event_along
 from magtensor.loop.searching.profiling import already
 from magtensor.loop.searching.rivals import hardly_begun
@@ -65,10 +66,10 @@ def fitted(record: Record, before: Trial, chosen: Candidate, how: Fitting) -> Fi
                 after, hurt = fewer, []
     if hurt:
         return Fitted(after, f"fitted, it raises the held-out error of {', '.join(hurt)}", tuple(hurt))
-    return Fitted(after, why_not(before, after, chosen, how))
+    return Fitted(after, why_not(record, before, after, chosen, how))
 
 
-def why_not(before: Trial, after: Trial, chosen: Candidate, how: Fitting) -> str:
+def why_not(record: Record, before: Trial, after: Trial, chosen: Candidate, how: Fitting) -> str:
     """What a fit without and with a candidate, and perhaps others behind it, says against the candidate; "" if nothing
     does."""
     x, which = after.state.excitation, len(before.state.adopted)
@@ -108,6 +109,8 @@ def why_not(before: Trial, after: Trial, chosen: Candidate, how: Fitting) -> str
         terms = chosen.terms.only(i for i, s in enumerate(chosen.terms.sensors) if s in acts_on)
         if channel := channel_instead(seen, terms, chosen.assessment.colours):
             return f"C of {', '.join(acts_on)} follows {channel}, which explains more than something that happens once"
+        if better_left_out(record, before.state, after.state, which, how):
+            return "fitted, its samples are far from its law: the others are fitted better without them"
     return ""
 
 

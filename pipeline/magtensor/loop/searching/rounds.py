@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 from magtensor.components import Component
 from magtensor.error_models.excitation import Excitation
 from magtensor.error_models.needs import missing
 from magtensor.loop.fitting.model import CHANNEL, Fitting, Record, State, generic
+from magtensor.loop.fitting.refit import settled
 from magtensor.loop.fitting.trial import Trial, on_the_folds_of, per_sample, trial
 from magtensor.loop.remainder.curve_of_a_channel import another_curve
 from magtensor.loop.remainder.tones import channels_of_the_line, tones
@@ -48,6 +50,11 @@ class Ended:
     how: Fitting
     steps: tuple[Step, ...]
     shared: Sought | None
+
+    @cached_property
+    def settled(self) -> State:
+        """The fit without the samples that nothing explains."""
+        return settled(self.record, self.state, self.how)
 
     @property
     def adopts(self) -> bool:
@@ -247,7 +254,7 @@ class Rounds:
             return None
         before = on_the_folds_of(both, record, before, how)
         helped = before.helped_by(both)
-        if before.hurt_by(both) or not set(alone.hurt) <= set(helped) or why_not(before, both, chosen, how):
+        if before.hurt_by(both) or not set(alone.hurt) <= set(helped) or why_not(record, before, both, chosen, how):
             return None
         return Kept(both, chosen, then=(second.step(state, candidates),))
 

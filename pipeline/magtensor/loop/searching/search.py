@@ -11,14 +11,18 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
+import numpy as np
+
+from magtensor.calibration.joint_together import ABOUT, among_their_like
 from magtensor.components import Component
 from magtensor.error_models.excitation import Excitation
 from magtensor.error_models.needs import missing
 from magtensor.errors import DataError
 from magtensor.loop.fitting.model import Adopted, Fitting, Record, State, of_the_site
-from magtensor.loop.fitting.refit import joint_state, loud_stretches
+from magtensor.loop.fitting.refit import joint_state, loud_stretches, settled
 from magtensor.loop.fitting.trial import on_the_folds_of, trial
 from magtensor.loop.fitting.wandering import all_noise, narrowed_to, of_sensors, quieter, unweighed
+from magtensor.loop.remainder.flagged import lasting
 from magtensor.loop.searching.adopting import on_those_that_show
 from magtensor.loop.searching.contribution import borne_out, eliminate, over_at_once, without_models
 from magtensor.loop.searching.found import Search, Step
@@ -62,10 +66,13 @@ def search(
     first = joint_state(record, declared, how)
     rounds = Rounds(models, len(declared), most_effects, alpha, lines, say)
     ended = _without_what_is_loud(rounds.run(record, first, how), rounds)
-    if how.nominal is None and len(ended.state.adopted) - len(declared) < most_effects:
-        ended = _without_those_that_wander(ended, rounds)
+    if len(ended.state.adopted) - len(declared) < most_effects:
+        ended = _without_what_is_wrong(ended, rounds)
+        if how.nominal is None:
+            ended = _without_those_that_wander(ended, rounds)
     record, state, how, steps = ended.record, ended.state, ended.how, ended.steps
-    last = _settled(record, on_those_that_show(record, state, how, len(declared)), how)
+    shown = on_those_that_show(record, state, how, len(declared))
+    last = ended.settled if shown is state else settled(record, shown, how)
     over = any(over_at_once(last, place) for place in range(len(declared), len(last.adopted)))
     if over or (state.fit.keep & ~last.fit.keep).any():  # what only these samples asked for goes with them
         last, steps = _weighed_once_more(record, last, steps, how, len(declared))
@@ -90,7 +97,7 @@ def search(
         source = None if name == NAME else rounds.with_source(record, state, how, step, sought(state, record))[1]
         if source is not None:  # which the model that is gone was a part of
             record, state, step = source
-        steps, last = (*steps, step), _settled(record, state, how)
+        steps, last = (*steps, step), settled(record, state, how)
         not_tested = _not_tested(last.excitation, models)
         found = replace(
             found, last=last, steps=steps, not_tested=not_tested, record=record, shared=sought(last, record),
@@ -116,13 +123,22 @@ def _without_what_is_loud(ended: Ended, rounds: Rounds) -> Ended:
     return replace(again, steps=(*ended.steps, *again.steps))
 
 
+def _without_what_is_wrong(ended: Ended, rounds: Rounds) -> Ended:
+    """The search gone on without the stretches that it believed and nothing has explained, where there are any of more
+    than `ABOUT` samples: a sensor that is wrong by far hides what all show. As it ended where nothing more is found."""
+    wrong = among_their_like(np.asarray(ended.state.fit.keep) & ~np.asarray(ended.settled.fit.keep))
+    if not lasting(wrong, longest=ABOUT).any():
+        return ended
+    again = rounds.run(ended.record, ended.settled, replace(ended.how, searching=False))
+    return replace(again, steps=(*ended.steps, *again.steps)) if again.adopts else ended
+
+
 def _without_those_that_wander(ended: Ended, rounds: Rounds) -> Ended:
     """The search gone on among the quiet sensors alone; what they show is then fitted on all sensors, each weighed by
     all of its noise, and the search goes on there. Where they show nothing more, C and o are fitted with these weights
     all the same: they would have a share of what is not theirs."""
-    settled = _settled(ended.record, ended.state, ended.how)  # what is flagged is no wandering
     wandering = False
-    for names in quieter(settled):
+    for names in quieter(ended.settled):  # what is flagged is no wandering
         wandering = True
         try:
             gone_on = _among(names, ended, rounds)
@@ -132,7 +148,7 @@ def _without_those_that_wander(ended: Ended, rounds: Rounds) -> Ended:
             return gone_on
     if not wandering:
         return ended
-    how = replace(ended.how, noise=all_noise(settled))
+    how = replace(ended.how, noise=all_noise(ended.settled))
     again = joint_state(ended.record, ended.state.adopted, how, ended.state.theta, ended.state.lines)
     return replace(ended, state=again, how=how)
 
@@ -172,12 +188,7 @@ def _weighed_once_more(
     left, dropped = eliminate(record, state, how, fixed)
     if not dropped:
         return state, steps
-    return _settled(record, left, how), (*steps[:-1], replace(steps[-1], dropped=(*steps[-1].dropped, *dropped)))
-
-
-def _settled(record: Record, state: State, how: Fitting) -> State:
-    """The fit at the end: what nothing explains is a disturbance after all, and no part of the calibration."""
-    return joint_state(record, state.adopted, replace(how, searching=False), state.theta, state.lines)
+    return settled(record, left, how), (*steps[:-1], replace(steps[-1], dropped=(*steps[-1].dropped, *dropped)))
 
 
 def _require_channels(x: Excitation, declared: Sequence[Adopted]) -> None:

@@ -1,0 +1,68 @@
+"""A sensor that is wrong for a while, by thousands of nT and by no law of an event, is flagged while it is: it spoils
+neither the calibration nor the search."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from loop_cases import Array, scenario, survey_file
+
+import magtensor
+from magtensor.loop.evidence.stretches import louder_in
+
+SEARCHED = ["offset_while", "offset_step", "scale_step", "temperature_offset", "latent_source"]
+
+
+def x_negated(b: Array) -> Array:
+    return b * [-1.0, 1.0, 1.0]
+
+
+def x_and_y_exchanged(b: Array) -> Array:
+    return b[:, [1, 0, 2]]
+
+
+def twice_on_z(b: Array) -> Array:
+    return b * [1.0, 1.0, 2.0]
+
+
+@pytest.mark.parametrize(
+    ("wrong", "first", "count"),
+    [
+        (x_negated, 1440, 96),
+        pytest.param(x_negated, 720, 440, marks=pytest.mark.long),
+        (x_and_y_exchanged, 720, 288),
+        (twice_on_z, 1680, 240),
+    ],
+)
+@pytest.mark.parametrize("effect", [False, True])
+def test_it_is_flagged(wrong: Callable[[Array], Array], first: int, count: int, effect: bool, tmp_path: Path) -> None:
+    effects = [{"type": "temperature_offset", "rms_nT": 0.5}] if effect else []
+    path = survey_file(tmp_path, scenario(4, *effects))
+    with h5py.File(path, "r+") as file:
+        rows = slice(first, first + count)
+        file["b_raw"][rows, 1] = wrong(file["b_raw"][rows, 1])
+    done = magtensor.close_loop(path, search=SEARCHED)
+    assert [a["error_model"] for a in done.verdict["adopted"]] == ["temperature_offset"] * effect
+    assert done.verdict["unexplained"]["present"]
+    assert "mostly on S2" in done.verdict["unexplained"]["description"]
+    assert done.verdict["noise_floor_nT"] == pytest.approx(0.15, abs=0.01)
+    good = done.computed.survey.good
+    assert not good[rows].any()
+    assert good[: max(first - 20, 0)].mean() > 0.99 and good[first + count + 20 :].mean() > 0.99
+    assert done.verdict["error"]["held_out"]["after"]["total_field_rms_nT"]["S2"] < 0.2
+
+
+def test_of_a_stretch_that_is_doubted_most_is_louder_or_nothing() -> None:
+    """Samples that come near the others now and then are none of the others'; noise that is louder is believed."""
+    rng = np.random.default_rng(8)
+    values, keep = rng.standard_normal((2000, 9)), np.ones(2000, dtype=bool)
+    values[700:800] += 3000.0 * np.sin(np.arange(100) / 2.0)[:, None]
+    keep[700:800] = np.abs(values[700:800]).max(axis=1) < 10.0
+    assert not louder_in(keep, [(9, values)])[701:799].any()
+    loud = rng.standard_normal((2000, 9))
+    loud[700:800] *= 30.0
+    assert louder_in(keep, [(9, loud)])[720:780].all()
