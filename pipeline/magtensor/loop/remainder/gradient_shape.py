@@ -29,7 +29,8 @@ def gradient_share(state: State, position: Array | None) -> float:
 
     Returns
     -------
-    Within 0 and 1; 0 where the array cannot tell, where one waveform would do, or where other directions hold too much.
+    Within 0 and 1; 0 where the array cannot tell, where one waveform would do, where other directions hold too much, or
+    less than white noise does: the noise of a sensor is not what it was taken for then.
     """
     residual = state.residual
     if position is None or residual.across is None:
@@ -48,6 +49,8 @@ def gradient_share(state: State, position: Array | None) -> float:
     total, of_gradient = float(np.trace(covariance)) - most * white, float(inside.sum())
     each_outside, each_inside = (total - of_gradient) / (most - held), of_gradient / held
     if of_gradient < BEYOND_CHANCE * white * np.sqrt(2.0 * held / n):
+        return 0.0
+    if each_outside < -BEYOND_CHANCE * white * np.sqrt(2.0 / (most - held) / n):  # less than the noise that was assumed
         return 0.0
     if each_outside > MOST_OUTSIDE * each_inside or inside[-2] < LEAST_SECOND * inside[-1]:
         return 0.0
