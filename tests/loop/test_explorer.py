@@ -137,7 +137,7 @@ def test_a_source_that_the_log_shows_is_none_that_nobody_logged(survey: Path) ->
 
 
 def test_a_model_without_its_channel(survey: Path) -> None:
-    with pytest.raises(magtensor.DataError, match=r"supply_scale needs supply\*.*it logs current_heater, temperature"):
+    with pytest.raises(magtensor.DataError, match=r"supply_scale needs supply\*.*logs current_heater, temperature"):
         magtensor.explore(survey, search=["supply_scale"]).adopt("supply_scale")
 
 

@@ -51,7 +51,7 @@ def test_errors_of_the_sensors_and_a_single_waveform_have_no_such_shape() -> Non
 
 
 def test_nothing_has_that_shape_where_a_sensor_has_less_noise_than_its_quickest_errors() -> None:
-    """Its noise, known from what is quickest, is taken for more than it is, and the shape of the others' noise is left."""
+    """Its noise, known from what is quickest, is taken for more than it is: the others' shape is left."""
     walk = 5.0 * np.sin(2.0 * np.pi * 0.46 * np.arange(1200))[:, None] * np.array([[1.0, 0.5, -0.3]])
     assert share_of(np.where(np.arange(4)[:, None] == 2, walk[:, None], 0.0), CROSS) == 0.0
 

@@ -25,6 +25,18 @@ FACTS: dict[str, Callable[[Excitation], bool]] = {
 }
 
 
+IN_WORDS = {
+    "rotation": "a field that turns, so slowly between samples that its rate of change is known",
+    "gradient": "a field that differs between the sensors",
+    "travel": "a field that changes along the way",
+}
+
+
+def in_words(need: str) -> str:
+    """A need as one says it to somebody who has not read the error model."""
+    return " or ".join(IN_WORDS.get(option, option) for option in need.split("|"))
+
+
 def missing(component: Component, x: Excitation) -> list[str]:
     """The needs of an error model that a survey does not meet, as the model words them."""
     notes = [m for p in component.parameters.values() for m in getattr(p.annotation, "__metadata__", ())]

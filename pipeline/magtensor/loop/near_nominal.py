@@ -11,6 +11,7 @@ from magtensor.calibration.undetermined import Undetermined, undetermined
 from magtensor.errors import DataError
 from magtensor.loop.fitting.model import Fitting
 from magtensor.loop.fitting.refit import require_determined
+from magtensor.loop.fitting.refit import settled as fitted_in_the_end
 from magtensor.loop.inquiry import Inquiry
 from magtensor.loop.searching.found import Search
 
@@ -27,7 +28,7 @@ def settled(inquire: Inquire, how: Fitting, nominal: Nominal | None) -> tuple[In
 
     Returns
     -------
-    Beside the two, why the fit without a prior was refused; "" where it was not.
+    Beside the two, why the fit without a prior was refused; "" where it was not, or the end needs none.
 
     Raises
     ------
@@ -47,9 +48,22 @@ def settled(inquire: Inquire, how: Fitting, nominal: Nominal | None) -> tuple[In
     if nominal is None or how.nominal is not None:
         raise refusal
     try:
-        return *ended(replace(how, nominal=nominal)), refusal.what
+        inquiry, found = ended(replace(how, nominal=nominal))
     except DataError as error:
         raise _refused(refusal, error) from error
+    free = _by_itself(found)
+    return (inquiry, found, refusal.what) if free is None else (inquiry, free, "")
+
+
+def _by_itself(found: Search) -> Search | None:
+    """The search with the calibration that its samples and effects determine without the prior, which only what had no
+    name before, or samples that are flagged now, made necessary; None where they determine none."""
+    how = replace(found.how, nominal=None)
+    try:
+        require_determined(found.record, found.last, how)
+        return replace(found, last=fitted_in_the_end(found.record, found.last, how), how=how)
+    except DataError:
+        return None
 
 
 def begun(inquire: Inquire, how: Fitting, nominal: Nominal | None) -> Inquiry:

@@ -16,6 +16,7 @@ from magtensor.loop.fitting.model import State
 MODEL = "site_gradient"
 MOST_OUTSIDE = 0.1  # of the variance of each of its directions: what any other direction holds at most
 LEAST_SECOND = 0.05  # of the strongest direction: a single waveform of any source has but one
+CLEARLY = 5.0  # times the variance of any other direction, where the noise is not known
 BEYOND_CHANCE = 5.0  # standard deviations of the white noise's own variance
 _RANK = 1e-6
 
@@ -29,8 +30,9 @@ def gradient_share(state: State, position: Array | None) -> float:
 
     Returns
     -------
-    Within 0 and 1; 0 where the array cannot tell, where one waveform would do, where other directions hold too much, or
-    less than white noise does: the noise of a sensor is not what it was taken for then.
+    Within 0 and 1; 0 where the array cannot tell, where one waveform would do, where other directions hold too much.
+    Where they hold less than white noise does, a sensor's noise is not what it was taken for, and the share has to be
+    clear without it.
     """
     residual = state.residual
     if position is None or residual.across is None:
@@ -50,7 +52,8 @@ def gradient_share(state: State, position: Array | None) -> float:
     each_outside, each_inside = (total - of_gradient) / (most - held), of_gradient / held
     if of_gradient < BEYOND_CHANCE * white * np.sqrt(2.0 * held / n):
         return 0.0
-    if each_outside < -BEYOND_CHANCE * white * np.sqrt(2.0 / (most - held) / n):  # less than the noise that was assumed
+    less = each_outside < -BEYOND_CHANCE * white * np.sqrt(2.0 / (most - held) / n)  # than the noise that was assumed
+    if less and each_inside + white < CLEARLY * (each_outside + white):
         return 0.0
     if each_outside > MOST_OUTSIDE * each_inside or inside[-2] < LEAST_SECOND * inside[-1]:
         return 0.0

@@ -16,7 +16,7 @@ import numpy as np
 from magtensor.calibration.joint_together import ABOUT, among_their_like
 from magtensor.components import Component
 from magtensor.error_models.excitation import Excitation
-from magtensor.error_models.needs import missing
+from magtensor.error_models.needs import in_words, missing
 from magtensor.errors import DataError
 from magtensor.loop.fitting.model import Adopted, Fitting, Record, State, of_the_site
 from magtensor.loop.fitting.refit import joint_state, loud_stretches, settled
@@ -199,12 +199,14 @@ def _require_channels(x: Excitation, declared: Sequence[Adopted]) -> None:
     DataError: the survey lacks some.
     """
     words = [
-        f"{model.name} needs {' and '.join(lacks)}" for model in declared if (lacks := missing(model.component, x))
+        f"{model.name} needs {' and '.join(map(in_words, lacks))}"
+        for model in declared
+        if (lacks := missing(model.component, x))
     ]
     if words:
         raise DataError(
             f"the declared error models cannot be fitted to this survey: {'; '.join(words)}",
-            hint=f"it logs {', '.join(sorted(x.logged)) or 'no channel'}; leave the model out or log what it follows",
+            hint=f"the survey logs {', '.join(sorted(x.logged)) or 'no channel'}; leave the model out or log what it follows",
         )
 
 
