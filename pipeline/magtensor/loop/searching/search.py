@@ -204,9 +204,10 @@ def _require_channels(x: Excitation, declared: Sequence[Adopted]) -> None:
         if (lacks := missing(model.component, x))
     ]
     if words:
+        logs = ", ".join(sorted(x.logged)) or "no channel"
         raise DataError(
             f"the declared error models cannot be fitted to this survey: {'; '.join(words)}",
-            hint=f"the survey logs {', '.join(sorted(x.logged)) or 'no channel'}; leave the model out or log what it follows",
+            hint=f"the survey logs {logs}; leave the model out or log what it follows",
         )
 
 
