@@ -19,8 +19,11 @@ SEARCHED = ["reference_clock", "reference_scale", "reference_drift", "scale_drif
 
 @pytest.mark.parametrize(
     ("delay_s", "seed", "beyond_s"),
-    [(12.0, 41, 60.0), (-910.0, 45, 1200.0), (3600.0, 44, 5400.0)],
-    ids=["seconds", "minutes", "a time zone"],
+    [
+        pytest.param(12.0, 41, 60.0, id="seconds", marks=pytest.mark.long),
+        pytest.param(-910.0, 45, 1200.0, id="minutes"),
+        pytest.param(3600.0, 44, 5400.0, id="a time zone", marks=pytest.mark.long),
+    ],
 )
 def test_the_delay_is_found_and_the_lag_is_the_delay(
     delay_s: float, seed: int, beyond_s: float, tmp_path: Path
