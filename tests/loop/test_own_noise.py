@@ -182,15 +182,17 @@ def with_gap(seed: int, first: int, end: int, added: Array | None = None) -> Sta
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("slow", [{}, {0: 0.1, 1: 0.1, 2: 0.1, 3: 0.1}])
+@pytest.mark.parametrize(
+    "slow", [{}, pytest.param({0: 0.1, 1: 0.1, 2: 0.1, 3: 0.1}, marks=pytest.mark.long)], ids=["white", "slow too"]
+)
 def test_a_jump_beside_a_gap_is_no_likelier_than_elsewhere(slow: dict[int, float]) -> None:
     """The last sample before a gap and the first after it have noise, which does not go on through the gap."""
     offset_step = Registry.load().find("error_model", "offset_step")
     p = []
-    for seed in range(230, 242):
+    for seed in range(230, 235):
         state = with_gap(seed, 600, 900, noisy(seed, slow, 60.0))
         noise = OwnNoise(state.residual, None)
-        for time_s in (200.0, 595.0, 598.0, 901.0, 905.0):
+        for time_s in (200.0, 598.0, 901.0):
             p.append(noise.p_value(offset_step.function(state.excitation, time_s=time_s).at(state.residual.samples)))
     assert min(p) > 1e-3
     assert np.mean(np.array(p) < 0.01) < 0.1

@@ -14,7 +14,7 @@ from loop_cases import Array, scenario, survey_file
 import magtensor
 from magtensor.loop.evidence.stretches import louder_in
 
-SEARCHED = ["offset_while", "offset_step", "scale_step", "temperature_offset", "latent_source"]
+SEARCHED = ["offset_while", "offset_step", "temperature_offset"]
 
 
 def x_negated(b: Array) -> Array:

@@ -21,6 +21,7 @@ from .whole_record import Limits
 FALSE_REJECTION = 0.01  # probability that one clean sample of the whole survey is rejected
 LEAST_FOR_REJECTION = 50  # with fewer samples the fit bends to an outlier, and no residual can tell which it was
 ABOUT = 25  # samples that a sample lies among
+MOSTLY = 2 / 3  # of them
 _TOLD_APART = 2  # rounds after which the noise of two sensors no longer moves
 
 
@@ -90,13 +91,13 @@ def fit_together(
 
 
 def among_their_like(doubted: Mask) -> Mask:
-    """(N,) doubted samples, and others that most of those about them are: a sensor that is wrong for a while comes near
-    what is right now and then, and what is then believed of it spoils the fit."""
-    from scipy.ndimage import median_filter
+    """(N,) doubted samples, and others that two thirds of those about them are: a sensor that is wrong for a while
+    comes near what is right now and then, and what is then believed of it spoils the fit."""
+    from scipy.ndimage import uniform_filter1d
 
-    if np.count_nonzero(doubted) <= ABOUT // 2:
+    if np.count_nonzero(doubted) < MOSTLY * ABOUT:
         return doubted
-    return doubted | median_filter(doubted.astype(np.uint8), size=ABOUT, mode="nearest").astype(bool)
+    return doubted | (uniform_filter1d(doubted.astype(float), ABOUT, mode="nearest") > MOSTLY)
 
 
 def unfolded(plane: CommonField, scalar: ScalarFit) -> tuple[Array, Array]:

@@ -20,13 +20,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtensor.calibration.joint import JointFit
-from magtensor.calibration.joint_together import ABOUT, FALSE_REJECTION, among_their_like
+from magtensor.calibration.joint_together import ABOUT, FALSE_REJECTION, MOSTLY, among_their_like
 from magtensor.calibration.types import Array, Mask
 from magtensor.loop.evidence.folds import FOLDS
 from magtensor.loop.evidence.residual import residual_of
 
 NEIGHBOURS = 5  # samples of a running median: what lasts for three of them is no spike
-MOSTLY = 2 / 3  # of a stretch that a fit doubts, if it is louder
 LEAST_LOUD = 50  # samples: of fewer nobody knows how loud they are
 LIMITS = 40  # of the loudness, tried
 WORTH_IT = 0.5  # of the variance of a calibration from all samples is left, where some are left out for it

@@ -124,10 +124,10 @@ def _without_what_is_loud(ended: Ended, rounds: Rounds) -> Ended:
 
 
 def _without_what_is_wrong(ended: Ended, rounds: Rounds) -> Ended:
-    """The search gone on without the stretches that it believed and nothing has explained, where there are any of more
-    than `ABOUT` samples: a sensor that is wrong by far hides what all show. As it ended where nothing more is found."""
-    wrong = among_their_like(np.asarray(ended.state.fit.keep) & ~np.asarray(ended.settled.fit.keep))
-    if not lasting(wrong, longest=ABOUT).any():
+    """The search gone on without the stretches that it believed and nothing has explained, where more than `ABOUT`
+    samples are of such: a sensor that is wrong by far hides what all show. As it ended where nothing more is found."""
+    wrong = lasting(among_their_like(~np.asarray(ended.settled.fit.keep)), longest=ABOUT)
+    if np.count_nonzero(wrong & ended.state.fit.keep) <= ABOUT:
         return ended
     again = rounds.run(ended.record, ended.settled, replace(ended.how, searching=False))
     return replace(again, steps=(*ended.steps, *again.steps)) if again.adopts else ended
