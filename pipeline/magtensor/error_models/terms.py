@@ -97,21 +97,22 @@ class Terms:
         return all((s, 3 * (o // 3) + axis) in touched for s, o in touched for axis in range(3))
 
     def only(self, keep: Iterable[int]) -> Terms:
-        """The terms of these numbers, in this order."""
+        """The terms of these numbers, in this order, with the series that they have."""
         order = list(keep)
         place = {old: new for new, old in enumerate(order)}
         parts = [i for i, t in enumerate(self.part_term) if int(t) in place]
+        used, which = np.unique(self.part_series[parts], return_inverse=True)
         return Terms(
             tuple(self.names[i] for i in order),
             tuple(self.sensors[i] for i in order),
             tuple(self.units[i] for i in order),
-            self.series,
+            self.series[:, used],
             np.array([place[int(self.part_term[i])] for i in parts], dtype=int),
             self.part_output[parts],
-            self.part_series[parts],
-            self.delay,
+            which.astype(int),
+            None if self.delay is None else self.delay[:, used],
             self.part_weight[parts],
-            self.noise,
+            self.noise[used],
         )
 
     @property

@@ -1,0 +1,50 @@
+"""A sensor that is taken off and put back: it is turned and has another offset from one moment on, and neither explains
+what the other leaves."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from loop_cases import adopted_names, linear_state, loaded, scenario, verdict_of
+
+from magtensor.loop.evidence.own_noise import OwnNoise
+from magtensor.loop.fitting.model import Adopted, Fitting
+from magtensor.loop.fitting.refit import joint_state
+from magtensor.loop.searching.contribution import eliminate
+from magtensor.registry import Registry
+
+AT = 500.0
+BOTH = ("turn_step", "offset_step")
+
+
+def remounted(seed: int) -> dict[str, Any]:
+    none = [0.0] * 3
+    turned = {"type": "turn_step", "time_s": AT, "arcmin": [none, none, [-0.4, -0.2, 0.15], none]}
+    moved = {"type": "offset_step", "time_s": [AT], "nT": [none, none, [-1.4, -2.5, -3.6], none]}
+    return scenario(seed, turned, moved)
+
+
+@pytest.mark.parametrize("seed", [3, pytest.param(4, marks=pytest.mark.long)])
+def test_both_steps_are_found(seed: int, tmp_path: Path) -> None:
+    found = verdict_of(tmp_path, remounted(seed), models=[*BOTH, "temperature_offset", "temperature_alignment"])
+    assert adopted_names(found) == set(BOTH)
+    assert all("S3" in a["sensors"] for a in found["adopted"])
+    assert not found["unexplained"]["present"]
+
+
+def test_a_step_beside_another_model_is_tested_as_a_single_series(tmp_path: Path) -> None:
+    """Terms of a model beside others are those that it has alone, so that the exact law of one series holds."""
+    record = loaded(tmp_path, remounted(3))
+    models = [Adopted(Registry.load().find("error_model", name), {"time_s": AT}, ("S3",)) for name in BOTH]
+    state = joint_state(record, models, Fitting())
+    assert eliminate(record, state, Fitting(), 0)[1] == ()
+    assert state.terms is not None
+    turn, step = state.terms.only(range(3)), state.terms.only(range(3, 6))
+    x = linear_state(record).excitation
+    alone = models[1].terms(x).at(state.residual.samples)
+    assert step.series.shape == alone.series.shape and np.array_equal(step.series, alone.series)
+    noise = OwnNoise(state.residual, turn)
+    assert noise.p_value(step) == pytest.approx(noise.p_value(alone))
