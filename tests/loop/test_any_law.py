@@ -63,10 +63,10 @@ LAWS: dict[str, Callable[[Array], Array]] = {
     "without sign": np.abs,
     "threshold": lambda v: 1.0 * (v > 0.4),
 }
-LONG = ("dead zone", "saturation", "root", "one way", "without sign")
 
 
-@pytest.mark.parametrize("law", [pytest.param(law, marks=pytest.mark.long) if law in LONG else law for law in LAWS])
+@pytest.mark.long  # `test_a_dead_zone_ends_where_it_does` is one of them
+@pytest.mark.parametrize("law", LAWS)
 def test_a_law_that_is_no_power_is_found_and_nothing_beside_it(law: str) -> None:
     """Of the channel that it follows, and no source that nobody logged; what is left is noise."""
     values = course(3)

@@ -94,6 +94,7 @@ def test_a_core_that_was_warmer_than_its_skin_at_the_start(tmp_path: Path) -> No
     assert after < 1.1 * here and after < 0.7 * before
 
 
+@pytest.mark.long
 def test_evidence_stays_with_a_model_whose_form_has_moved(tmp_path: Path) -> None:
     told = close_loop(warmed(tmp_path, 61, 3.0), search=["temperature_offset", "channel_response"]).verdict
     (adopted,) = told["adopted"]
@@ -155,7 +156,8 @@ def test_a_beginning_at_its_limit_is_none(part: float, limit: bool, tmp_path: Pa
     assert not at_its_limit(model, settings | {"lag_s": 5.0, "delayed": True}, x)  # a delay has no beginning
 
 
-@pytest.mark.parametrize("sensors", [3, pytest.param(4, marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("sensors", [3, 4])
 def test_what_is_taken_to_begin_in_equilibrium_is_told(sensors: int, tmp_path: Path) -> None:
     array = [[0.25, 0.0, 0.0], [-0.25, 0.0, 0.0], [0.0, 0.25, 0.0], [0.0, -0.25, 0.1]][:sensors]
     instrument = BASE["instrument"] | {"array": {"positions_m": array}}

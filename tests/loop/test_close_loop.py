@@ -114,6 +114,7 @@ def test_a_survey_in_memory_is_the_one_of_the_file(form: str, surveys: tuple[Pat
             assert np.array_equal(read.values(path), from_file.values(path))
 
 
+@pytest.mark.long
 def test_a_survey_in_memory_gives_the_same_bits(found: ClosedLoop, surveys: tuple[Path, Path]) -> None:
     again = magtensor.close_loop(read_canonical(surveys[0]), search=SEARCH)
     assert content(again) == content(found)

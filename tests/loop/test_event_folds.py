@@ -113,6 +113,7 @@ def test_a_vehicle_is_found_wherever_it_passes(at: float, tmp_path: Path) -> Non
     assert not told["unexplained"]["present"]
 
 
+@pytest.mark.long
 def test_a_base_station_that_is_restless_for_a_while_is_no_vehicle(tmp_path: Path) -> None:
     def restless(path: Path) -> None:
         with h5py.File(path, "a") as file:

@@ -111,6 +111,7 @@ def test_a_delay_is_found_between_sensors_and_none_common_to_all(tmp_path: Path)
         assert lag["S1"] - lag.get(sensor, 0.0) == pytest.approx(2e-3, rel=5e-3)
 
 
+@pytest.mark.long
 def test_two_effects_at_once(tmp_path: Path) -> None:
     effects = (
         {"type": "temperature_offset", "rms_nT": 1.0, "lag_s": 100.0},

@@ -55,12 +55,13 @@ BEND = {"type": "channel_response", "channel": "temperature", "power": 2, "lag_s
 LINE = {"type": "temperature_offset", "lag_s": 100.0}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("effects", "order"),
     [
         ([LINE | {"rms_nT": 0.5}], 1),
-        pytest.param([BEND | {"rms_nT": 0.5}], 2, marks=pytest.mark.long),
-        pytest.param([LINE | {"rms_nT": 0.4}, BEND | {"rms_nT": 0.4}], 2, marks=pytest.mark.long),
+        ([BEND | {"rms_nT": 0.5}], 2),
+        ([LINE | {"rms_nT": 0.4}, BEND | {"rms_nT": 0.4}], 2),
     ],
     ids=["line", "bend", "both"],
 )

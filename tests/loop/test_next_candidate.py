@@ -98,6 +98,7 @@ def test_a_small_part_of_what_failed_is_no_candidate() -> None:
     assert not rivals.overlaps(of(3), failed, state)
 
 
+@pytest.mark.long
 def test_of_every_model_it_is_told_why_it_was_not_adopted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The first candidate is refused and all others are said to be parts of it, so that nothing is adopted; most
     explain too little to be looked at closely."""

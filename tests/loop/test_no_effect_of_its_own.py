@@ -124,6 +124,7 @@ def test_a_sensor_that_switches_has_no_offsets_for_a_while(
     assert "offset_while" in [s["adopted"] for s in told["steps"]]  # what this is about
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("sensors", [None, pytest.param(["S1"], marks=pytest.mark.long)])
 def test_a_warming_up_that_is_soon_over(tmp_path: Path, sensors: list[str] | None) -> None:
     """A twentieth of the survey: nothing of it is known without the first fold."""
