@@ -6,8 +6,10 @@ import re
 from pathlib import Path
 from typing import Any
 
+import h5py
+import numpy as np
 import pytest
-from loop_cases import linear_state, loaded, scenario
+from loop_cases import BASE, linear_state, loaded, scenario, verdict_of
 
 from magtensor.loop.remainder.jitter import jitter_words
 
@@ -33,3 +35,19 @@ def test_it_is_found_with_its_size(seed: int, tmp_path: Path) -> None:
 @pytest.mark.parametrize("seed", [101, 102, 103])
 def test_nothing_else_is_taken_for_it(what: str, seed: int, tmp_path: Path) -> None:
     assert jitter_words(linear_state(loaded(tmp_path, scenario(seed, *EFFECTS[what])))) == []
+
+
+def with_two_ranges(path: Path) -> None:
+    """S2 reads a nT more on x, and less on y, where its output is beyond 25 000 nT."""
+    with h5py.File(path, "r+") as survey:
+        raw = survey["b_raw"][:]
+        raw[:, 1] += (np.abs(raw[:, 1]) > 25_000.0) * np.array([1.0, -1.0, 0.5])
+        survey["b_raw"][...] = raw
+
+
+def test_a_law_that_the_field_sweeps_through_is_no_scatter(tmp_path: Path) -> None:
+    """What its outputs predict is none of its noise, however fast the field takes it from one end to the other."""
+    survey = scenario(101, motion=BASE["motion"] | {"rate_rms_deg_s": 30.0, "rate_time_s": 4.0})
+    assert jitter_words(linear_state(loaded(tmp_path, survey, with_two_ranges)))
+    told = verdict_of(tmp_path, survey, with_two_ranges, [])["unexplained"]["description"]
+    assert "can be predicted" in told and "early or late" not in told

@@ -58,8 +58,31 @@ def test_a_lag_that_nothing_asks_for_is_given_up(lag_s: float, tmp_path: Path) -
     model = Registry.load().find("error_model", "temperature_offset")
     settings = {"channel": "temperature", "order": 1, "lag_s": lag_s or 4.0, "delayed": False, "at_start": 0.0}
     state = joint_state(record, [Adopted(model, settings)], Fitting())
-    found = adopting._without_lags(record, state, Fitting())
+    found = adopting._with_lags_that_show(record, state, Fitting())
     assert found.adopted[0].settings["lag_s"] == lag_s
+
+
+@pytest.mark.parametrize(
+    ("effect", "setting", "others", "abs_s"),
+    [
+        (
+            {"type": "temperature_offset", "rms_nT": 1.5, "lag_s": 60.0},
+            "lag_s",
+            {"channel": "temperature", "order": 1, "delayed": False, "at_start": 0.0},
+            10.0,
+        ),
+        ({"type": "eddy_current", "rms_nT": 5.0, "tau_s": 0.02}, "tau_s", {}, 0.003),
+    ],
+)
+def test_a_lag_that_shows_only_now_is_taken(
+    effect: dict[str, Any], setting: str, others: dict[str, Any], abs_s: float, tmp_path: Path
+) -> None:
+    """A model that was adopted without its lag, while others hid it: one between two of the grid, and one below all."""
+    record = loaded(tmp_path, scenario(3, effect, rate_Hz=4.0))
+    model = Registry.load().find("error_model", effect["type"])
+    state = joint_state(record, [Adopted(model, {**others, setting: 0.0})], Fitting())
+    found = adopting.polished(record, state, Fitting())
+    assert found.adopted[0].settings[setting] == pytest.approx(effect[setting], abs=abs_s)
 
 
 @pytest.mark.parametrize(

@@ -155,9 +155,9 @@ def _sensors_showing(state: State, which: int) -> tuple[str, ...] | None:
 def polished(record: Record, state: State, how: Fitting) -> State:
     """The forms of the models, what they began with and their settings on a range, sought once more now that everything
     is fitted together; a setting that is a little off leaves a residual that another model would be adopted for. Beside
-    one that has moved another form may be right, and no lag be needed."""
+    one that has moved another form may be right, and a lag show that did not, or no longer be needed."""
     state = _at_rest(record, _as_they_began(record, _in_their_forms(record, state, how), how), how)
-    formed = _in_their_forms(record, _without_lags(record, state, how), how)
+    formed = _in_their_forms(record, _with_lags_that_show(record, state, how), how)
     return state if formed is state else _at_rest(record, formed, how)
 
 
@@ -183,9 +183,9 @@ def _at_rest(record: Record, state: State, how: Fitting) -> State:
     return state
 
 
-def _without_lags(record: Record, state: State, how: Fitting) -> State:
-    """The models without the lags that the data do not separate from none beside the others; of two of one kind, what
-    one lacks the other makes up for."""
+def _with_lags_that_show(record: Record, state: State, how: Fitting) -> State:
+    """The models without the lags that the data do not separate from none beside the others, and with those that they
+    do; of two of one kind, what one lacks the other makes up for."""
     names = [model.name for model in state.adopted]
     for number, model in enumerate(state.adopted):
         if names.count(model.name) > 1:
@@ -193,9 +193,11 @@ def _without_lags(record: Record, state: State, how: Fitting) -> State:
         gain = _Beside.of(state, number)
         best = dict(model.settings)
         for name, grid in profiled(model.component).items():
-            if not of_ratios(grid) or grid.low > 0 or not best.get(name):
+            if not of_ratios(grid) or grid.low > 0 or name not in best:
                 continue
             none = {**best, name: 0.0, **_of_the_lag(model, name)}
+            if not best[name]:
+                best[name] = _best_of(gain, best, name, [0.0, *(v for v in grid.values(state.excitation) if v > 0)])
             if gain(none) > gain(best) - SEPARATION / 2.0:
                 best = none
         if best != model.settings:
@@ -283,6 +285,18 @@ def _changed(record: Record, state: State, number: int, settings: Mapping[str, A
     models = list(state.adopted)
     models[number] = replace(models[number], settings={**models[number].settings, **settings})
     return joint_state(record, models, how, state.theta)
+
+
+def _best_of(
+    gain: Callable[[Mapping[str, Any]], float], settings: Mapping[str, Any], name: str, values: Sequence[float]
+) -> float:
+    """The best of some values of a setting, in order, and of what lies between it and its neighbours."""
+
+    def at(value: float) -> float:
+        return gain({**settings, name: value})
+
+    best = max(range(len(values)), key=lambda i: at(values[i]))
+    return golden(at, values[max(best - 1, 0)], values[min(best + 1, len(values) - 1)], values[best])
 
 
 def _near(gain: Callable[[Mapping[str, Any]], float], settings: Mapping[str, Any], name: str, low: float) -> float:

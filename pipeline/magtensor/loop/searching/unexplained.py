@@ -91,9 +91,10 @@ def _what_shows(found: Search, record: Record, excess: float, sparse: SparseRead
     following, changing = shared_out(
         lambda of: of(state), [attitude_words, lambda state: [m.words for m in changing_matrices(state, ALPHA)]]
     )
-    words.extend(following or converter_words(state))
+    predictable = following or converter_words(state)
+    words.extend(predictable)
     words.extend(shortened_words(state))
-    words.extend(jitter_words(state))
+    words.extend([] if predictable else jitter_words(state))  # a field that turns sweeps through a law that it lacks
     words.extend(changing)
     noise = float(np.hypot(OwnNoise(state.residual, None).slow_along(), of_the_station(state, record)))
     noise = float(np.hypot(noise, sparse.between if sparse is not None else 0.0))
