@@ -188,6 +188,14 @@ def test_a_spike_of_a_stormy_record_is_found() -> None:
     assert np.flatnonzero(spikes(record, 8.0)).tolist() == [60, 230]
 
 
+def test_spikes_near_the_end_of_a_record_are_found() -> None:
+    """What is usual beside the end is not what the last reading is like, next to a spike."""
+    at = np.arange(127)
+    record = np.round(48_000 + 12.0 * np.sin(at / 15.0) + 0.2 * np.random.default_rng(6).normal(size=127), 1)
+    record[[106, 124]] += [45.0, -60.0]
+    assert np.flatnonzero(spikes(record, 8.0)).tolist() == [106, 124]
+
+
 @pytest.mark.parametrize("slope", [0.0, -0.1, 0.3])
 def test_the_readings_beside_a_step_are_no_spikes(slope: float) -> None:
     at = np.arange(400)

@@ -126,7 +126,7 @@ def _scale(deviation: Floats, least: float) -> Floats:
     """(N,) standard deviation that magnitudes (N,) show, over all of them or around each, the larger one."""
     from scipy.ndimage import percentile_filter
 
-    around = percentile_filter(deviation, 75, SPIKE_SURROUNDINGS, mode="nearest") / 1.1503  # of a Gaussian
+    around = percentile_filter(deviation, 75, SPIKE_SURROUNDINGS, mode="mirror") / 1.1503  # of a Gaussian
     found: Floats = np.maximum(np.maximum(around, 1.4826 * np.median(deviation)), least)
     return found
 
