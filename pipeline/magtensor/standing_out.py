@@ -2,7 +2,8 @@
 
 Another survey may cross any field, so that only the outputs are judged which neither a uniform field nor a gradient
 moves. Even there a near source shows, and a range that ends, and an effect nobody knows: but not for one sample and
-its neighbour only.
+its neighbour only. Along a gradient, which three sensors in a plane do not tell from a disturbance of one, only what is
+far beyond anything beside it.
 """
 
 from __future__ import annotations
@@ -20,6 +21,10 @@ BY = "apply"
 REASON = "stands out alone: no calibration and no noise explain it"
 LONGEST = 2  # samples: what lasts longer is left to speak for itself
 BEND = 0.5  # off field and gradient, over along the gradient: a source three baselines away shows less
+WITHOUT_FOOT = (
+    50.0  # times what its neighbours differ from theirs: a source three baselines away leaves more there if it
+)
+# moves by less than seven in a sample
 SURROUNDINGS = 101  # samples over which the level of the noise may change
 
 
@@ -107,11 +112,30 @@ def _beyond_noise(parts: list[Array], gradient: Array | None, doubted: Mask) -> 
             level = np.maximum(np.median(square), median_filter(square, size=SURROUNDINGS, mode="nearest"))
             beyond &= square > limit * level
         out |= beyond
-    return out
+    return out if gradient is None else out | _without_foot(gradient, doubted)
+
+
+def _without_foot(gradient: Array, doubted: Mask) -> Mask:
+    """(N,) samples at which the outputs that a gradient moves (N, G) depart from those before and from those after, to
+    the same side, by far more than the nearest of these from the next: no source comes and goes so fast."""
+    sides = _two_beside(gradient, doubted)
+    apart = [gradient - side.mean(axis=0) for side in sides]
+    scale = np.maximum(np.median(np.abs(apart[0]), axis=0), 1e-300)
+    foot = np.max([np.linalg.norm((side[0] - side[1]) / scale, axis=1) for side in sides], axis=0)
+    least = WITHOUT_FOOT * np.maximum(foot, np.median(foot))
+    size = np.min([np.linalg.norm(each / scale, axis=1) for each in apart], axis=0)
+    found: Mask = (np.sum(apart[0] * apart[1] / scale**2, axis=1) > 0) & (size > least)
+    return found
 
 
 def _beside(values: Array, doubted: Mask) -> tuple[Array, Array]:
     """(N, K) each: means of the two samples before and of the two after, the doubted ones passed over."""
+    before, after = _two_beside(values, doubted)
+    return before.mean(axis=0), after.mean(axis=0)
+
+
+def _two_beside(values: Array, doubted: Mask) -> tuple[Array, Array]:
+    """(2, N, K) each: the two samples before and the two after, the nearest first, the doubted ones passed over."""
     believed = np.flatnonzero(~doubted)
     index = np.arange(len(values))
     first, last = np.searchsorted(believed, index), np.searchsorted(believed, index, side="right")
@@ -120,7 +144,7 @@ def _beside(values: Array, doubted: Mask) -> tuple[Array, Array]:
     for k in (0, 1):  # at an end there is one side only
         before[k] = np.where(first - k - 1 < 0, after[k], before[k])
         after[k] = np.where(last + k >= len(believed), before[k], after[k])
-    return values[np.stack(before)].mean(axis=0), values[np.stack(after)].mean(axis=0)
+    return values[np.stack(before)], values[np.stack(after)]
 
 
 def _of_gradients(survey: Survey, forward: Array) -> Array | None:

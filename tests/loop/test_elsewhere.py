@@ -232,6 +232,22 @@ def test_what_lasts_is_left_to_speak_for_itself() -> None:
     assert np.flatnonzero(standing_out([values])).tolist() == [100, 200, 201]
 
 
+def crossing(baselines: float, a_sample: float) -> NDArray[np.float64]:
+    """(600,) relative gradient of a dipole that is passed at sample 300, so many baselines away: it falls with r^-4."""
+    along = a_sample * (np.arange(600.0) - 300.0)
+    return np.asarray((1.0 + (along / baselines) ** 2) ** -2)
+
+
+@pytest.mark.parametrize(("of_gradient", "out"), [(crossing(3.0, 1e3), True), (crossing(3.0, 6.0), False)])
+def test_along_a_gradient_only_what_has_no_foot_stands_out(of_gradient: NDArray[np.float64], out: bool) -> None:
+    """A disturbance of one sensor of three in a plane may look like a gradient; a source leaves more beside it."""
+    rng = np.random.default_rng(1)
+    gradient = rng.standard_normal((600, 3)) + 1000.0 * of_gradient[:, None] * np.array([0.3, -0.8, 0.5])
+    quiet = rng.standard_normal((600, 1))
+    assert np.flatnonzero(standing_out([quiet], gradient)).tolist() == ([300] if out else [])
+    assert not standing_out([quiet], rng.standard_normal((600, 3))).any()
+
+
 @pytest.mark.long
 def test_a_source_that_cannot_be_taken_off_is_told(
     tmp_path: Path, folder: Path, capsys: pytest.CaptureFixture[str]
