@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from magtensor.calibration.types import Mask
+from magtensor.error_models.excitation import Excitation
 from magtensor.loop.evidence.own_noise import OwnNoise
 from magtensor.loop.evidence.residual import residual_of
 from magtensor.loop.fitting.log_noise import channels_of
@@ -18,6 +19,7 @@ LONGEST_SPIKE = 2  # samples: what lasts longer is no accident of the recording
 UNCOVERED = 2.0  # steps between samples
 ALIKE = 0.1  # of the mean square along the field, across it: an effect on each sensor shows as much in both
 AT_AN_END = 0.95  # of the other samples have smaller, or larger, values on average
+ALPHA = 0.001  # of the test whether samples after pauses are bad more often
 FAR = 3.0  # times the rms of slow noise: where it wanders furthest it stays for a while
 
 
@@ -29,6 +31,23 @@ def lasting(bad: Mask, excused: Mask | None = None, longest: int = LONGEST_SPIKE
     for start, stop in zip(edges[0::2], edges[1::2], strict=True):
         out[start:stop] = stop - start > longest and (excused is None or not excused[start:stop].any())
     return out
+
+
+def after_pauses(bad: Mask, x: Excitation) -> tuple[Mask, str]:
+    """(N,) bad samples at the beginnings of runs, if far more of the samples there are bad than of others, and this in
+    words; none, and "", otherwise."""
+    from scipy.special import bdtrc
+
+    first = np.zeros(len(bad), dtype=bool)
+    first[[a for a, b in x.runs()[1:] if b - a > LONGEST_SPIKE]] = True
+    pauses, found = int(first.sum()), int((first & bad).sum())
+    rest = ~first & ~np.concatenate(([False], first[:-1] & bad[:-1]))
+    usual = (int((rest & bad).sum()) + 1.0) / (int(rest.sum()) + 1.0)
+    if found <= LONGEST_SPIKE or bdtrc(found - 1, pauses, usual) > ALPHA:
+        return np.zeros(len(bad), dtype=bool), ""
+    starts = first & bad
+    starts[1:] |= starts[:-1] & bad[1:]  # and the next, of what has not come to rest after two
+    return starts, f"; they come first after {found} of {pauses} pauses: something has not come to rest then"
 
 
 def beyond_the_reference(state: State, record: Record) -> Mask:

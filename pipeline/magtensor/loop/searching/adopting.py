@@ -38,6 +38,15 @@ _RESTS = 0.02  # relative: a setting that moves no further is settled
 
 def adopt(record: Record, state: State, chosen: Candidate, how: Fitting) -> State:
     """Refit with the chosen model, first on all sensors, then on those that show it."""
+    after, which = on_all_sensors(record, state, chosen, how), len(state.adopted)
+    sensors = sensors_showing(after, which)
+    if sensors is None or not _spare(after, which, sensors):
+        sensors = _sufficient(after, which)
+    return after if sensors is None else narrowed(record, after, which, sensors, how)
+
+
+def on_all_sensors(record: Record, state: State, chosen: Candidate, how: Fitting) -> State:
+    """Refit with the chosen model on all its sensors, whether they show it or not."""
     models = [*state.adopted, chosen.model]
     # what it found of the others too: begun from zero, a strong slow effect would pass for the colour of the noise
     if chosen.moved is not None:
@@ -46,12 +55,7 @@ def adopt(record: Record, state: State, chosen: Candidate, how: Fitting) -> Stat
     else:
         moves = np.split(chosen.assessment.theta, np.cumsum([len(t) for t in state.theta]))
         start = [t + move for t, move in zip([*state.theta, np.zeros(chosen.terms.count)], moves, strict=True)]
-    after = joint_state(record, models, how, start)
-    which = len(state.adopted)
-    sensors = _sensors_showing(after, which)
-    if sensors is None or not _spare(after, which, sensors):
-        sensors = _sufficient(after, which)
-    return after if sensors is None else narrowed(record, after, which, sensors, how)
+    return joint_state(record, models, how, start)
 
 
 def narrowed(record: Record, state: State, which: int, sensors: tuple[str, ...], how: Fitting) -> State:
@@ -76,7 +80,7 @@ def on_those_that_show(record: Record, state: State, how: Fitting, fixed: int) -
     for which in range(fixed, len(state.adopted)):
         if state.adopted[which].name == NAME or len(state.adopted) == fixed + 1:
             continue
-        sensors = _sensors_showing(state, which)
+        sensors = sensors_showing(state, which)
         if sensors is not None and _spare(state, which, sensors):
             state = narrowed(record, state, which, sensors, how)
     return state
@@ -134,7 +138,7 @@ def _kept(state: State, which: int, sensors: tuple[str, ...]) -> list[int]:
     return [i for i, s in enumerate(state.terms.sensors) if not part.start <= i < part.stop or s in sensors or s == ""]
 
 
-def _sensors_showing(state: State, which: int) -> tuple[str, ...] | None:
+def sensors_showing(state: State, which: int) -> tuple[str, ...] | None:
     """Sensors whose own coefficients are significant; None where all are, or the model is not of single sensors."""
     part = slices(state)[which]
     assert state.terms is not None

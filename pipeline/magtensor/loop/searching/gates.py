@@ -20,6 +20,7 @@ SECOND_ORDER = 1e-5  # of the sum of squares that is explained: 0.3 % of an effe
 OF_THE_LAW = 0.0025  # the same, that the law of an effect may miss: 5 % of its size
 LEAST_REDUCTION = 1e-4  # of the held-out sum of squares: smaller is significant only in very long surveys
 MOST_LEFT = 0.1  # of the square of what there was, when something happened once: a third of its size
+UNEVENLY = 1.0  # paired t: one standard deviation; what predicts nothing has as much one time in six
 LOG_MARGIN = 1.5  # the noise of a log is known to some per cent
 LOG_DEVIATIONS = 3.0  # of what coefficients gain of it by chance
 
@@ -132,13 +133,20 @@ class Candidate:
     @property
     def predicts(self) -> bool:
         """Whether it is significant and predicts held-out blocks, in noise of the colour of what it leaves."""
-        if self.of_the_log or self.of_second_order or self.of_the_law:
+        return self._counts and (self.assessment.gain.consistent or self.predicts_where_it_acts)
+
+    @property
+    def predicts_unevenly(self) -> bool:
+        """Whether it falls short of that only because it predicts some blocks far better than others."""
+        return self._counts and not self.predicts and self.assessment.gain.t > UNEVENLY and self.beyond_slow_noise
+
+    @property
+    def _counts(self) -> bool:
+        """Whether it is significant, and no more of what is adopted or logged."""
+        if self.of_the_log or self.of_second_order or self.of_the_law or self.of_no_shape:
             return False
         gain = self.assessment.gain
-        if self.of_no_shape:
-            return False
-        reduction = gain.total / max(float(gain.before.sum()), 1e-300)
-        return self.significant and (gain.consistent or self.predicts_where_it_acts) and reduction > LEAST_REDUCTION
+        return self.significant and gain.total / max(float(gain.before.sum()), 1e-300) > LEAST_REDUCTION
 
     @property
     def predicts_where_it_acts(self) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from magtensor.error_models.excitation import Excitation
 from magtensor.error_models.settings import Range, profiled
@@ -12,7 +12,7 @@ from magtensor.loop.fitting.model import Adopted, Fitting, Record
 from magtensor.loop.fitting.trial import Trial, on_the_folds_of, trial
 from magtensor.loop.remainder.changing_matrix import channel_instead
 from magtensor.loop.remainder.curve_of_a_channel import event_of_a_curve
-from magtensor.loop.searching.adopting import adopt, narrowed, polished
+from magtensor.loop.searching.adopting import adopt, narrowed, on_all_sensors, polished
 from magtensor.loop.searching.beginnings import at_its_limit, began_with_a_vector
 from magtensor.loop.searching.contribution import (
     agrees,
@@ -53,7 +53,7 @@ def fitted(record: Record, before: Trial, chosen: Candidate, how: Fitting) -> Fi
     try:
         after = trial(record, polished(record, adopt(record, before.state, chosen, how), how), how)
     except DataError as error:  # with coefficients that run away nothing is left to calibrate
-        return Fitted(None, f"it cannot be fitted: {error.what.split(':')[0]}")
+        return _cannot(error)
     before = on_the_folds_of(after, record, before, how)
     hurt, which = before.hurt_by(after), len(before.state.adopted)
     if hurt:
@@ -67,6 +67,19 @@ def fitted(record: Record, before: Trial, chosen: Candidate, how: Fitting) -> Fi
     if hurt:
         return Fitted(after, f"fitted, it raises the held-out error of {', '.join(hurt)}", tuple(hurt))
     return Fitted(after, why_not(record, before, after, chosen, how))
+
+
+def fitted_everywhere(record: Record, before: Trial, chosen: Candidate, how: Fitting) -> Fitted:
+    """The same on all its sensors, of which another effect that has no name yet may hide it from some."""
+    try:
+        after = trial(record, polished(record, on_all_sensors(record, before.state, chosen, how), how), how)
+    except DataError as error:
+        return _cannot(error)
+    return Fitted(after, hurt=tuple(on_the_folds_of(after, record, before, how).hurt_by(after)))
+
+
+def _cannot(error: DataError) -> Fitted:
+    return Fitted(None, f"it cannot be fitted: {error.what.split(':')[0]}")
 
 
 def why_not(record: Record, before: Trial, after: Trial, chosen: Candidate, how: Fitting) -> str:
@@ -102,7 +115,10 @@ def why_not(record: Record, before: Trial, after: Trial, chosen: Candidate, how:
     theta = chosen.assessment.theta[-chosen.terms.count :]
     seen = chosen.before or before.state  # at the samples of its terms
     if happens_once(model):
-        if name := event_along(seen, chosen.terms, theta):
+        others = replace(after.state, adopted=after.state.adopted[:which], theta=after.state.theta[:which])
+        own = model.terms(x).at(after.state.residual.samples)
+        # fitted alone the other had a part of it, and so its vectors
+        if (name := event_along(seen, chosen.terms, theta)) and event_along(others, own, after.state.theta[which]):
             return f"it lies along the vectors of {name}, whose law may leave it"
         if channel := event_of_a_curve(seen, chosen.terms, theta, chosen.assessment.colours):
             return f"a curve of {channel} explains most of it: what is adopted may miss its law"

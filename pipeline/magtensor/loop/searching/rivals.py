@@ -74,6 +74,35 @@ def containing(best: Candidate, possible: Sequence[Candidate], state: State) -> 
     return best
 
 
+def as_predictive(chosen: Candidate, candidates: Sequence[Candidate], state: State) -> set[str]:
+    """Names of the models that predict held-out blocks better than the chosen one and leave it next to nothing, though
+    they are not significant for all that was tried of them.
+
+    What has no settings needs no correction for them, and is significant first, whatever the cause: a base station's
+    variation that is larger than the site's before a jump of it, which may have been at any time.
+    """
+
+    def does_better(other: Candidate) -> bool:
+        gain = other.assessment.gain
+        if other.significant or not gain.consistent or gain.total <= chosen.assessment.gain.total:
+            return False
+        whole, own, both = _beside(chosen, other, state)
+        return own <= whole and both - whole < SMALL_PART * own
+
+    return {c.model.name for c in candidates if c.model.name != chosen.model.name and does_better(c)}
+
+
+def moved_by_another(best: Candidate | None, candidates: Sequence[Candidate], state: State) -> Candidate | None:
+    """Of the candidates that predict some blocks far better than others the best, as they do where another effect that
+    has no name yet moves some blocks; None where the best of those that pass predicts more, or something else."""
+    uneven = [c for c in candidates if c.predicts_unevenly]
+    moved = max(uneven, key=lambda c: c.assessment.gain.total, default=None)
+    if moved is None or best is None:
+        return moved
+    more = moved.assessment.gain.total > best.assessment.gain.total + SEPARATION
+    return moved if more and overlaps(best, moved, state) else None
+
+
 def part_of(candidate: Candidate, other: Candidate, state: State) -> bool:
     """Whether a candidate predicts a small part of what another one does, and next to nothing beside it."""
     whole, own, both = _beside(candidate, other, state)

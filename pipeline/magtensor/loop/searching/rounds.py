@@ -20,13 +20,22 @@ from magtensor.loop.searching.course_of_time import beside_time, rivals_in_time
 from magtensor.loop.searching.exchange import looked_at_again, simpler
 from magtensor.loop.searching.found import Step
 from magtensor.loop.searching.gates import Candidate
-from magtensor.loop.searching.keeping import ONE_OF_A_KIND, UNEARNED, Fitted, fitted, why_not
+from magtensor.loop.searching.keeping import ONE_OF_A_KIND, UNEARNED, Fitted, fitted, fitted_everywhere, why_not
 from magtensor.loop.searching.larger_law import part_of_a_larger_law
 from magtensor.loop.searching.latent import NAME, Sought, Source, renewed, sought, tried_source
 from magtensor.loop.searching.likeness import followed_by_a_curve, part_of_the_source
+from magtensor.loop.searching.on_more_sensors import on_more_sensors
 from magtensor.loop.searching.own_fit import at_their_own_fit
 from magtensor.loop.searching.profiling import repeatable
-from magtensor.loop.searching.rivals import containing, overlaps, part_of, part_of_a_drift, simplest
+from magtensor.loop.searching.rivals import (
+    as_predictive,
+    containing,
+    moved_by_another,
+    overlaps,
+    part_of,
+    part_of_a_drift,
+    simplest,
+)
 from magtensor.loop.searching.screening import candidates_of
 from magtensor.loop.searching.split import split
 from magtensor.loop.searching.unknown_rate import rate_instead
@@ -114,7 +123,9 @@ class Rounds:
             steps.extend(adopted.then)
             if adopted.standing is not None:
                 record, state = renewed(record, adopted.standing.state, how)
-                standing = replace(adopted.standing, state=state)
+                earlier = range(self.fixed, len(state.adopted) - 1)
+                standing = on_more_sensors(record, replace(adopted.standing, state=state), how, earlier)
+                state = standing.state
                 if by_a_curve(state.adopted[-1]):  # of more pieces, before anything is adopted for what it leaves
                     standing, more = by_any_law(
                         record, standing, how, [len(state.adopted) - 1], self.alpha, open_, self.fixed
@@ -163,8 +174,8 @@ class Rounds:
         *,
         with_others: bool = True,
     ) -> Kept:
-        """Fit the candidates that pass, found among so many models, the best first, until one is kept; the first of
-        them that fails on held-out blocks may be kept with another beside it."""
+        """Fit the candidates that pass, found among so many models, the best first, until one is kept; one that fails
+        on held-out blocks, before it is fitted or after, may be kept with another beside it."""
         refused: dict[str, str] = {}
         asked: set[str] = set()  # channels whose curves have had their turn
         left = list(candidates)
@@ -173,8 +184,15 @@ class Rounds:
             refused[name] = why
             left[:] = [c for c in left if c.model.name != name]
 
-        while passing := [c for c in left if c.passes]:
-            best = max(passing, key=lambda c: c.assessment.gain.total)
+        while True:
+            passing = [c for c in left if c.passes]
+            best = max(passing, key=lambda c: c.assessment.gain.total, default=None)
+            if with_others and (moved := moved_by_another(best, left, before.state)):
+                with_others = False
+                if two := self.kept_with_another(record, before, moved, how, models):
+                    return replace(two, refused=refused)
+            if best is None:
+                break
             possible = [c for c in left if c.predicts]
             best = containing(best, possible, before.state)
             chosen, rivals = simplest(best, possible, before.state)
@@ -201,6 +219,7 @@ class Rounds:
             if name := rate_instead(chosen, before.state, self.models):
                 refuse(chosen.model.name, f"{name}, for which the field turns too fast between samples, explains more")
                 continue
+            rivals = tuple(sorted({*rivals, *as_predictive(chosen, candidates, before.state)}))
             if not time.seen:
                 rivals = tuple(sorted({*rivals, *rivals_in_time(chosen, possible, before.state)}))
             if self.say is not None:
@@ -233,6 +252,17 @@ class Rounds:
         if chosen.model.name in dropped and len(last.adopted) <= len(before.state.adopted):
             return replace(tried, why=UNEARNED), ()
         return (replace(tried, after=trial(record, last, how)) if dropped else tried), dropped
+
+    def kept_with_another(
+        self, record: Record, before: Trial, chosen: Candidate, how: Fitting, models: int
+    ) -> Kept | None:
+        """A candidate that does not predict by itself, if it passes both gates beside what is found when it is in."""
+        two = self.with_another(record, before, chosen, fitted_everywhere(record, before, chosen, how), how)
+        if two is None or two.standing is None:
+            return None
+        without = without_models(record, two.standing.state, [len(before.state.adopted)], how)
+        beside = looked_at_again(without, chosen, models)
+        return beside and replace(two, chosen=beside)
 
     def with_another(
         self, record: Record, before: Trial, chosen: Candidate, alone: Fitted, how: Fitting

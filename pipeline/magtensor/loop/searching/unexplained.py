@@ -19,7 +19,13 @@ from magtensor.loop.evidence.stretches import ABOUT, LEAST_LOUD
 from magtensor.loop.fitting.model import Fitting, Record, State
 from magtensor.loop.fitting.refit import disturbed, without
 from magtensor.loop.remainder.changing_matrix import changing_matrices
-from magtensor.loop.remainder.flagged import beyond_the_reference, flagged_words, lasting, unread_words
+from magtensor.loop.remainder.flagged import (
+    after_pauses,
+    beyond_the_reference,
+    flagged_words,
+    lasting,
+    unread_words,
+)
 from magtensor.loop.remainder.gradient_shape import MODEL, gradient_share
 from magtensor.loop.remainder.jitter import jitter_words
 from magtensor.loop.remainder.predictable import attitude_words, converter_words, shortened_words
@@ -44,7 +50,9 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
     state = found.told
     excess = excess_rms(state)
     sparse = sparse_readings(state, record)
-    flagged = lasting(disturbed(record, state, found.how), beyond_the_reference(state, record))
+    bad = disturbed(record, state, found.how)
+    starts, paused = after_pauses(bad, state.excitation)
+    flagged = lasting(bad, beyond_the_reference(state, record)) | starts
     suspects = Suspects.of(found, flagged, sparse)
     words = [*_what_shows(found, record, excess, sparse), *suspects.words]
     beside = [*loud_words(state, record, found.how), *unread_words(state, record)]
@@ -64,7 +72,7 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
     beside += suspects.small_words
     if flagged.any():
         left_out, noise = flagged_words(flagged, state, record, sparse)
-        (beside if noise else words).append(left_out)
+        (beside if noise and not paused else words).append(left_out + paused)
     present = bool(words)
     untested = [MODEL] if shaped and MODEL in found.not_tested else []
     return {

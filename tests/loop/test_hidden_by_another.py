@@ -1,0 +1,124 @@
+"""Effects that hide each other: each alone predicts some blocks far better than others, or some sensors not at all."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from loop_cases import BASE, adopted_names, loaded, scenario, verdict_of
+
+from magtensor.loop.fitting.model import Adopted, Fitting, Record
+from magtensor.loop.fitting.refit import joint_state
+from magtensor.loop.fitting.trial import trial
+from magtensor.loop.searching import rivals
+from magtensor.loop.searching.keeping import why_not
+from magtensor.loop.searching.likeness import event_along
+from magtensor.loop.searching.on_more_sensors import on_more_sensors
+from magtensor.loop.searching.screening import candidates_of
+from magtensor.registry import Registry
+
+TILTED = {"type": "limited_tilt", "duration_s": 1500.0, "tilt_deg": 40.0}
+FOLLOWING = {"channel": "temperature", "order": 1, "lag_s": 0.0, "delayed": False, "at_start": 0.0, "bends": ()}
+
+
+def getting_warmer(seed: int, *effects: dict[str, Any], wander_degC: float = 1.0, **changes: Any) -> dict[str, Any]:
+    """A survey of 25 minutes in which the temperature rises by 6 degrees."""
+    temperature = BASE["channels"]["temperature"] | {
+        "trend_degC_per_h": 15.0,
+        "self_heating_degC": 0.0,
+        "wander_rms_degC": wander_degC,
+    }
+    return scenario(seed, *effects, motion=TILTED, channels={"temperature": temperature}, **changes)
+
+
+def model(name: str, settings: dict[str, Any], *sensors: str) -> Adopted:
+    return Adopted(Registry.load().find("error_model", name), settings, sensors)
+
+
+@pytest.mark.parametrize(
+    ("seed", "rate_Hz", "times"),
+    [
+        (5, 1.0, 2.0),
+        pytest.param(3, 2.0, 1.0, marks=pytest.mark.long),
+        pytest.param(6, 2.0, 2.0, marks=pytest.mark.long),
+    ],
+)
+def test_a_step_and_a_temperature_are_found(seed: int, rate_Hz: float, times: float, tmp_path: Path) -> None:
+    """Alone the step is far beyond chance and predicts on balance, but the blocks that the temperature moves worse."""
+    survey = getting_warmer(
+        seed,
+        {"type": "temperature_offset", "rms_nT": 0.15 * times, "lag_s": 40.0},
+        {"type": "offset_step", "rms_nT": 0.3 * times, "time_s": [600.0]},
+        rate_Hz=rate_Hz,
+    )
+    found = verdict_of(tmp_path, survey, None, ["temperature_offset", "offset_step", "offset_drift"])
+    assert adopted_names(found) == {"temperature_offset", "offset_step"} and len(found["adopted"]) == 2
+    step = next(a for a in found["adopted"] if a["error_model"] == "offset_step")
+    assert step["settings"]["time_s"] == pytest.approx(600.0, abs=2.0)
+    assert all(len(a["sensors"]) == 4 for a in found["adopted"])
+
+
+def test_vectors_that_an_effect_had_of_an_event_are_no_objection(tmp_path: Path) -> None:
+    """Fitted without the step, the temperature has the most of it, and its vectors."""
+    effects = (
+        {"type": "temperature_offset", "rms_nT": 0.15},
+        {"type": "offset_step", "rms_nT": 0.6, "time_s": [750.0]},
+    )
+    record = loaded(tmp_path, getting_warmer(6, *effects, wander_degC=0.2, rate_Hz=1.0))
+    following, step = model("temperature_offset", FOLLOWING), model("offset_step", {"time_s": 750.0})
+    before = trial(record, joint_state(record, [following], Fitting()), Fitting())
+    (chosen,) = candidates_of(before.state, [step.component], {}, 0.005)
+    assert event_along(before.state, chosen.terms, chosen.assessment.theta[-chosen.terms.count :])
+    after = trial(record, joint_state(record, [following, step], Fitting()), Fitting())
+    assert why_not(record, before, after, chosen, Fitting()) == ""
+
+
+@pytest.fixture(scope="module")
+def warmed(tmp_path_factory: pytest.TempPathFactory) -> Record:
+    """Three of four sensors follow the temperature."""
+    effect = {"type": "temperature_offset", "rms_nT": 0.3, "sensors": ["S1", "S2", "S3"]}
+    return loaded(tmp_path_factory.mktemp("warmed"), getting_warmer(4, effect, rate_Hz=1.0))
+
+
+@pytest.mark.parametrize("begun", [("S1",), ("S1", "S2"), ("S1", "S2", "S3")])
+def test_an_effect_goes_to_the_sensors_that_show_it_and_to_no_other(warmed: Record, begun: tuple[str, ...]) -> None:
+    state = joint_state(warmed, [model("temperature_offset", FOLLOWING, *begun)], Fitting())
+    standing = trial(warmed, state, Fitting())
+    found = on_more_sensors(warmed, standing, Fitting(), range(1))
+    assert found.state.adopted[0].sensors == ("S1", "S2", "S3")
+    assert (found is standing) is (len(begun) == 3)
+    assert len(found.state.theta[0]) == 9 and found.state.residual.square() < 1.3
+
+
+@pytest.mark.parametrize(
+    ("total", "significant", "beside", "named"),
+    [
+        (95.0, False, 1.0, {"other"}),
+        (60.0, False, 1.0, set()),  # it predicts less
+        (95.0, True, 1.0, set()),  # it was compared with the chosen one as it is
+        (95.0, False, 70.0, set()),  # it is about something else
+    ],
+)
+def test_what_predicts_more_is_named_though_it_needed_more_tests(
+    total: float, significant: bool, beside: float, named: set[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def candidate(name: str, gained: float, proven: bool) -> Any:
+        gain = SimpleNamespace(total=gained, consistent=True)
+        return SimpleNamespace(
+            model=SimpleNamespace(name=name), significant=proven, assessment=SimpleNamespace(gain=gain)
+        )
+
+    chosen, other = candidate("chosen", 77.0, True), candidate("other", total, significant)
+    monkeypatch.setattr(rivals, "_beside", lambda *_: (total, 77.0, total + beside))
+    assert rivals.as_predictive(chosen, [chosen, other], SimpleNamespace()) == named  # type: ignore[arg-type]
+
+
+def test_what_was_cancelled_is_looked_for_again(warmed: Record) -> None:
+    """Nothing is done where every sensor has it already."""
+    state = joint_state(warmed, [model("temperature_offset", FOLLOWING)], Fitting())
+    standing = trial(warmed, state, Fitting())
+    assert on_more_sensors(warmed, standing, Fitting(), range(1)) is standing
+    assert np.isfinite(state.theta[0]).all()
