@@ -49,3 +49,11 @@ def test_a_time_constant_is_no_shorter_than_the_samples_show(tmp_path: Path) -> 
     assert min(grid.values(known)) >= grid.least(known) == known.spacing
     assert min(grid.values(unknown)) >= grid.least(unknown) == 2.0 * unknown.spacing
     assert Range(0.1, 100.0).least(unknown) < 0.1
+
+
+def test_postures_show_a_time_constant_of_one_of_them(tmp_path: Path) -> None:
+    """Between two rests the platform turns steadily; what is not recorded there is none of what is not seen."""
+    rests = {"type": "postures", "random_count": 60, "rest_s": 10.0, "turn_s": 3.0, "average": True}
+    resting = linear_state(loaded(tmp_path, scenario(4, motion=rests))).excitation
+    assert not resting.turns
+    assert Range(0.1, 100.0, sampled=True).least(resting) == resting.spacing == pytest.approx(13.0)

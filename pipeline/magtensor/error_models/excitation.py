@@ -349,6 +349,11 @@ class Excitation(Acting):
         """Whether the field turns, and slowly enough between the samples of a run for its rate to be known."""
         return rates.rate_known(self.time, self.runs(), self.field[:, 0])
 
+    @property
+    def turns_unseen(self) -> bool:
+        """Whether there are runs long enough to tell how the field turns, and it does so too fast, or not at all."""
+        return not self.turns and max(b - a for a, b in self.runs()) >= rates.LEAST_IN_A_RUN
+
     @cached_property
     def rate(self) -> Array:
         """dB/dt (N, 3) nT/s where all sensors see one field, else (N, S, 3)."""

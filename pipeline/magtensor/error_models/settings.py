@@ -52,10 +52,10 @@ class Range:
         return [v for v in self._grid(x) if v >= self.least(x)]
 
     def least(self, x: Excitation) -> float:
-        """The least value that the samples of a survey can show."""
+        """The least value that the samples of a survey can show, s."""
         if not self.sampled:
             return -np.inf
-        return x.spacing if x.turns else 2.0 * x.spacing
+        return 2.0 * x.spacing if x.turns_unseen else x.spacing
 
     def _grid(self, x: Excitation) -> list[float]:
         low, high = (self.low * x.duration, self.high * x.duration) if self.of_duration else (self.low, self.high)
