@@ -53,10 +53,11 @@ def _that_may_show(state: State, place: int) -> list[str]:
     left_out = [s for s in x.sensors if s not in acts] if model.sensors and model.name != NAME else []
     if not left_out:
         return []
+    assert state.terms is not None
     now, found = explained(estimated(state.residual, state.terms, state.colours)), []
     for sensor in left_out:
         own = replace(model, sensors=(sensor,)).terms(x).at(state.residual.samples)
-        together = own if state.terms is None else joined([state.terms, own])
+        together = joined([state.terms, own])
         gained = explained(estimated(state.residual, together, state.colours)) - now
         if own.count and float(chdtrc(own.count, max(gained, 0.0))) < KEEP_ALPHA / len(left_out):
             found.append(sensor)

@@ -262,7 +262,7 @@ class Rounds:
             return None
         without = without_models(record, two.standing.state, [len(before.state.adopted)], how)
         beside = looked_at_again(without, chosen, models)
-        return beside and replace(two, chosen=beside)
+        return None if beside is None else replace(two, chosen=beside)
 
     def with_another(
         self, record: Record, before: Trial, chosen: Candidate, alone: Fitted, how: Fitting
