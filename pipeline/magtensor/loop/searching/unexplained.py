@@ -24,6 +24,7 @@ from magtensor.loop.remainder.flagged import (
     beyond_the_reference,
     flagged_words,
     lasting,
+    seen_alike,
     unread_words,
 )
 from magtensor.loop.remainder.gradient_shape import MODEL, gradient_share
@@ -107,10 +108,10 @@ def _what_shows(found: Search, record: Record, excess: float, sparse: SparseRead
     noise = float(np.hypot(OwnNoise(state.residual, None).slow_along(), of_the_station(state, record)))
     noise = float(np.hypot(noise, sparse.between if sparse is not None else 0.0))
     if (slow := slow_along(state)) > max(MUCH * state.residual.scale, TWICE * noise):
-        words.append(
-            f"{slow:.3g} nT rms of |b| - F, in all sensors alike, is no white noise: an error of the base station, or "
-            "a field at the site that it does not see"
-        )
+        alike = seen_alike(state.residual)
+        where = "in all sensors alike" if alike else "in their mean"
+        cause = ": an error of the base station, or a field at the site that it does not see" if alike else ""
+        words.append(f"{slow:.3g} nT rms of |b| - F, {where}, is no white noise{cause}")
     return words
 
 
@@ -211,7 +212,7 @@ def _where(state: State) -> str:
     count = len(residual.along)
     between = float(np.sum(residual.across**2)) - count * (residual.freedom - 1)
     if float(np.sum(residual.along**2)) - count > max(between, 0.0):
-        return "mostly in |b| - F, alike in all sensors"
+        return f"mostly in |b| - F{', alike in all sensors' * seen_alike(state.residual)}"
     return _on_sensors(state)
 
 
