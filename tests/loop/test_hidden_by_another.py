@@ -14,6 +14,7 @@ from magtensor.loop.fitting.model import Adopted, Fitting, Record
 from magtensor.loop.fitting.refit import joint_state
 from magtensor.loop.fitting.trial import trial
 from magtensor.loop.searching import rivals
+from magtensor.loop.searching.gates import Candidate
 from magtensor.loop.searching.keeping import why_not
 from magtensor.loop.searching.likeness import event_along
 from magtensor.loop.searching.on_more_sensors import on_more_sensors
@@ -74,6 +75,46 @@ def test_vectors_that_an_effect_had_of_an_event_are_no_objection(tmp_path: Path)
     assert event_along(before.state, chosen.terms, chosen.assessment.theta[-chosen.terms.count :])
     after = trial(record, joint_state(record, [following, step], Fitting()), Fitting())
     assert why_not(record, before, after, chosen, Fitting()) == ""
+
+
+@pytest.mark.parametrize(
+    ("significant", "predicts", "gained", "t", "may"),
+    [
+        (True, False, 30.0, 1.5, True),
+        (True, True, 30.0, 2.5, False),  # nothing hinders it
+        (True, False, 30.0, 0.5, False),  # it predicts nothing
+        (False, False, 30.0, 2.5, False),  # what noise does
+        (False, False, 150.0, 2.5, True),  # what no noise does
+        (False, False, 150.0, 1.5, False),
+    ],
+)
+def test_what_another_effect_may_keep_from_passing(
+    significant: bool, predicts: bool, gained: float, t: float, may: bool
+) -> None:
+    gain = SimpleNamespace(total=gained, t=t, consistent=t > 2.0, before=np.full(10, 100.0))
+    candidate: Any = SimpleNamespace(
+        significant=significant,
+        predicts=predicts,
+        beyond_slow_noise=True,
+        assessment=SimpleNamespace(gain=gain),
+        _more_than_known=True,
+    )
+    assert Candidate.may_be_hindered.fget(candidate) is may  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize(
+    ("passing", "part", "first"), [(None, True, True), (20.0, True, True), (20.0, False, False), (60.0, True, False)]
+)
+def test_it_has_its_turn_before_a_part_of_it(
+    passing: float | None, part: bool, first: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def candidate(gained: float, hindered: bool) -> Any:
+        return SimpleNamespace(may_be_hindered=hindered, assessment=SimpleNamespace(gain=SimpleNamespace(total=gained)))
+
+    monkeypatch.setattr(rivals, "overlaps", lambda *_: part)
+    best, hindered = None if passing is None else candidate(passing, False), candidate(50.0, True)
+    found = rivals.hindered_by_another(best, [c for c in (best, hindered) if c], SimpleNamespace())  # type: ignore[arg-type]
+    assert (found is hindered) is first and (first or found is None)
 
 
 @pytest.fixture(scope="module")

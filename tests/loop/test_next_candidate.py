@@ -142,7 +142,7 @@ def test_what_another_width_of_an_adopted_law_explains_is_no_other_effect(
     monkeypatch.setattr(rounds, "nearest", unchanged)
     monkeypatch.setattr(rounds, "_outdone", lambda *_: "")
     monkeypatch.setattr(rounds, "rate_instead", lambda *_: "")
-    monkeypatch.setattr(rounds, "moved_by_another", lambda *_: None)
+    monkeypatch.setattr(rounds, "hindered_by_another", lambda *_: None)
     monkeypatch.setattr(rounds, "as_predictive", lambda *_: set())
     monkeypatch.setattr(rounds, "part_of_a_larger_law", lambda *_: "")
     monkeypatch.setattr(rounds, "part_of_a_drift", lambda *_: "")
@@ -181,7 +181,7 @@ def test_of_one_name_the_curve_of_another_channel_is_still_tried(monkeypatch: py
         "part_of_a_larger_law": lambda *_: "",
         "part_of_a_drift": lambda *_: "",
         "rate_instead": lambda *_: "",
-        "moved_by_another": lambda *_: None,
+        "hindered_by_another": lambda *_: None,
         "as_predictive": lambda *_: set(),
         "beside_time": lambda *_: BesideTime(True),
         "_outdone": lambda chosen, _: "wind" if chosen is line else "",

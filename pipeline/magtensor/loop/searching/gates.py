@@ -21,6 +21,7 @@ OF_THE_LAW = 0.0025  # the same, that the law of an effect may miss: 5 % of its 
 LEAST_REDUCTION = 1e-4  # of the held-out sum of squares: smaller is significant only in very long surveys
 MOST_LEFT = 0.1  # of the square of what there was, when something happened once: a third of its size
 UNEVENLY = 1.0  # paired t: one standard deviation; what predicts nothing has as much one time in six
+MUCH = 0.1  # of the held-out sum of squares: no noise of a clean survey is predicted so well
 LOG_MARGIN = 1.5  # the noise of a log is known to some per cent
 LOG_DEVIATIONS = 3.0  # of what coefficients gain of it by chance
 
@@ -136,17 +137,28 @@ class Candidate:
         return self._counts and (self.assessment.gain.consistent or self.predicts_where_it_acts)
 
     @property
-    def predicts_unevenly(self) -> bool:
-        """Whether it falls short of that only because it predicts some blocks far better than others."""
-        return self._counts and not self.predicts and self.assessment.gain.t > UNEVENLY and self.beyond_slow_noise
+    def may_be_hindered(self) -> bool:
+        """Whether it may fail because another effect that has no name yet moves some blocks: it is significant, and
+        predicts some of them far better than others; or it is not, but predicts much."""
+        gain = self.assessment.gain
+        if not self._more_than_known:
+            return False
+        if self.significant:
+            return not self.predicts and gain.t > UNEVENLY and self.beyond_slow_noise
+        return gain.consistent and gain.total > MUCH * float(gain.before.sum())
 
     @property
     def _counts(self) -> bool:
         """Whether it is significant, and no more of what is adopted or logged."""
+        return self.significant and self._more_than_known
+
+    @property
+    def _more_than_known(self) -> bool:
+        """Whether neither what is adopted nor the log's noise explains it, and it is large enough to matter."""
         if self.of_the_log or self.of_second_order or self.of_the_law or self.of_no_shape:
             return False
         gain = self.assessment.gain
-        return self.significant and gain.total / max(float(gain.before.sum()), 1e-300) > LEAST_REDUCTION
+        return gain.total / max(float(gain.before.sum()), 1e-300) > LEAST_REDUCTION
 
     @property
     def predicts_where_it_acts(self) -> bool:

@@ -92,15 +92,14 @@ def as_predictive(chosen: Candidate, candidates: Sequence[Candidate], state: Sta
     return {c.model.name for c in candidates if c.model.name != chosen.model.name and does_better(c)}
 
 
-def moved_by_another(best: Candidate | None, candidates: Sequence[Candidate], state: State) -> Candidate | None:
-    """Of the candidates that predict some blocks far better than others the best, as they do where another effect that
-    has no name yet moves some blocks; None where the best of those that pass predicts more, or something else."""
-    uneven = [c for c in candidates if c.predicts_unevenly]
-    moved = max(uneven, key=lambda c: c.assessment.gain.total, default=None)
-    if moved is None or best is None:
-        return moved
-    more = moved.assessment.gain.total > best.assessment.gain.total + SEPARATION
-    return moved if more and overlaps(best, moved, state) else None
+def hindered_by_another(best: Candidate | None, candidates: Sequence[Candidate], state: State) -> Candidate | None:
+    """Of the candidates that another effect, which has no name yet, may keep from passing, the best; None where the
+    best of those that pass predicts more, or something else."""
+    hindered = max((c for c in candidates if c.may_be_hindered), key=lambda c: c.assessment.gain.total, default=None)
+    if hindered is None or best is None:
+        return hindered
+    more = hindered.assessment.gain.total > best.assessment.gain.total + SEPARATION
+    return hindered if more and overlaps(best, hindered, state) else None
 
 
 def part_of(candidate: Candidate, other: Candidate, state: State) -> bool:

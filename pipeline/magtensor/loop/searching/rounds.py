@@ -30,7 +30,7 @@ from magtensor.loop.searching.profiling import repeatable
 from magtensor.loop.searching.rivals import (
     as_predictive,
     containing,
-    moved_by_another,
+    hindered_by_another,
     overlaps,
     part_of,
     part_of_a_drift,
@@ -187,9 +187,9 @@ class Rounds:
         while True:
             passing = [c for c in left if c.passes]
             best = max(passing, key=lambda c: c.assessment.gain.total, default=None)
-            if with_others and (moved := moved_by_another(best, left, before.state)):
+            if with_others and (hindered := hindered_by_another(best, left, before.state)):
                 with_others = False
-                if two := self.kept_with_another(record, before, moved, how, models):
+                if two := self.kept_with_another(record, before, hindered, how, models):
                     return replace(two, refused=refused)
             if best is None:
                 break
