@@ -60,6 +60,7 @@ def test_a_step_and_a_temperature_are_found(seed: int, rate_Hz: float, times: fl
     step = next(a for a in found["adopted"] if a["error_model"] == "offset_step")
     assert step["settings"]["time_s"] == pytest.approx(600.0, abs=2.0)
     assert all(len(a["sensors"]) == 4 for a in found["adopted"])
+    assert not adopted_names(found) & {r for a in found["adopted"] for r in a["indistinguishable_from"]}
 
 
 def test_vectors_that_an_effect_had_of_an_event_are_no_objection(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 
 from magtensor.error_models.settings import Beginning, Bends, EventTimes, Forms, Frequencies, Range, profiled
 from magtensor.error_models.waveform import NAME
-from magtensor.loop.fitting.model import Adopted, Record
+from magtensor.loop.fitting.model import CHANNEL, Adopted, Record
 from magtensor.loop.searching.contribution import happens_once
 from magtensor.loop.searching.found import Search, Step, without_and_with
 from magtensor.loop.searching.gates import Candidate
@@ -94,7 +94,8 @@ def _adopted(found: Search, index: int) -> dict[str, Any]:
     units = state.terms.units[part]
     step = _step_of(found, model)
     before, after = without_and_with(found, index)
-    rivals = [] if step is None else list(step.rivals)
+    beside = {a.name for a in state.adopted} - {CHANNEL}  # what was adopted beside it is told apart from it
+    rivals = [] if step is None else [name for name in step.rivals if name not in beside]
     p = float("nan") if step is None or step.adopted is None else step.adopted.assessment.p
     return {
         "error_model": model.name,
