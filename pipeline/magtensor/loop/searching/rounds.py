@@ -189,7 +189,7 @@ class Rounds:
             best = max(passing, key=lambda c: c.assessment.gain.total, default=None)
             if with_others and (hindered := hindered_by_another(best, left, before.state)):
                 with_others = False
-                if two := self.kept_with_another(record, before, hindered, how, models):
+                if two := self.kept_with_another(record, before, hindered, candidates, how, models):
                     return replace(two, refused=refused)
             if best is None:
                 break
@@ -254,13 +254,25 @@ class Rounds:
         return (replace(tried, after=trial(record, last, how)) if dropped else tried), dropped
 
     def kept_with_another(
-        self, record: Record, before: Trial, chosen: Candidate, how: Fitting, models: int
+        self,
+        record: Record,
+        before: Trial,
+        chosen: Candidate,
+        candidates: Sequence[Candidate],
+        how: Fitting,
+        models: int,
     ) -> Kept | None:
-        """A candidate that does not predict by itself, if it passes both gates beside what is found when it is in."""
+        """One of the candidates that does not predict by itself, if it passes both gates beside what is found when it
+        is in, and would not be refused as one that passes."""
+        state = before.state
+        if beside_time(chosen, state).refused or part_of_a_larger_law(chosen, state):
+            return None
+        if part_of_a_drift(chosen, candidates, state) or rate_instead(chosen, state, self.models):
+            return None
         two = self.with_another(record, before, chosen, fitted_everywhere(record, before, chosen, how), how)
         if two is None or two.standing is None:
             return None
-        without = without_models(record, two.standing.state, [len(before.state.adopted)], how)
+        without = without_models(record, two.standing.state, [len(state.adopted)], how)
         beside = looked_at_again(without, chosen, models)
         return None if beside is None else replace(two, chosen=beside)
 
