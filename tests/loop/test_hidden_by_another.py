@@ -129,7 +129,7 @@ def warmed(tmp_path_factory: pytest.TempPathFactory) -> Record:
 def test_an_effect_goes_to_the_sensors_that_show_it_and_to_no_other(warmed: Record, begun: tuple[str, ...]) -> None:
     state = joint_state(warmed, [model("temperature_offset", FOLLOWING, *begun)], Fitting())
     standing = trial(warmed, state, Fitting())
-    found = on_more_sensors(warmed, standing, Fitting(), range(1))
+    found = on_more_sensors(warmed, standing, Fitting(), [0])
     assert found.state.adopted[0].sensors == ("S1", "S2", "S3")
     assert (found is standing) is (len(begun) == 3)
     assert len(found.state.theta[0]) == 9 and found.state.residual.square() < 1.3
@@ -156,11 +156,3 @@ def test_what_predicts_more_is_named_though_it_needed_more_tests(
     chosen, other = candidate("chosen", 77.0, True), candidate("other", total, significant)
     monkeypatch.setattr(rivals, "_beside", lambda *_: (total, 77.0, total + beside))
     assert rivals.as_predictive(chosen, [chosen, other], SimpleNamespace()) == named  # type: ignore[arg-type]
-
-
-def test_what_was_cancelled_is_looked_for_again(warmed: Record) -> None:
-    """Nothing is done where every sensor has it already."""
-    state = joint_state(warmed, [model("temperature_offset", FOLLOWING)], Fitting())
-    standing = trial(warmed, state, Fitting())
-    assert on_more_sensors(warmed, standing, Fitting(), range(1)) is standing
-    assert np.isfinite(state.theta[0]).all()

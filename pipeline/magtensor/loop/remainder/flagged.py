@@ -9,7 +9,7 @@ import numpy as np
 from magtensor.calibration.types import Mask
 from magtensor.error_models.excitation import Excitation
 from magtensor.loop.evidence.own_noise import OwnNoise
-from magtensor.loop.evidence.residual import Residual, residual_of
+from magtensor.loop.evidence.residual import residual_of
 from magtensor.loop.fitting.log_noise import channels_of
 from magtensor.loop.fitting.model import Record, State, unread
 from magtensor.loop.fitting.refit import without
@@ -77,17 +77,6 @@ def unread_words(state: State, record: Record) -> list[str]:
     ]
 
 
-def seen_alike(residual: Residual, where: Mask | None = None) -> bool:
-    """Whether what a residual holds above the white noise, at some of its samples or at all, is seen by all sensors
-    alike, as far as they could differ."""
-    if residual.across is None or residual.along is None:
-        return residual.across is None
-    some = slice(None) if where is None else where
-    own = (residual.across[some] ** 2 - np.diagonal(residual.projector)) * residual.noise**2  # nT2
-    shared = (residual.along[some] ** 2 - 1.0) / residual.reference_gain[some] ** 2
-    return bool(own.mean(axis=0).reshape(-1, 3).sum(axis=1).max() < ALIKE * shared.mean())
-
-
 def flagged_words(
     flagged: Mask, state: State, record: Record, sparse: SparseReadings | None = None
 ) -> tuple[str, bool]:
@@ -105,7 +94,7 @@ def flagged_words(
     if every.along is not None and shared > own.max():
         amount = float(np.sqrt(np.mean((every.along[flagged] / every.reference_gain[flagged]) ** 2)))
         usual = OwnNoise(state.residual, None).slow_along()
-        alike = every.across is not None and seen_alike(every, flagged)
+        alike = every.across is not None and own.max() < ALIKE * shared
         where = " of |b| - F" + (", in all sensors alike" if alike else "")
     else:
         worst = int(np.argmax(own))

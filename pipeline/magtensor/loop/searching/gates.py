@@ -134,7 +134,8 @@ class Candidate:
     @property
     def predicts(self) -> bool:
         """Whether it is significant and predicts held-out blocks, in noise of the colour of what it leaves."""
-        return self._counts and (self.assessment.gain.consistent or self.predicts_where_it_acts)
+        evenly = self.assessment.gain.consistent or self.predicts_where_it_acts
+        return self.significant and self._more_than_known and evenly
 
     @property
     def may_be_hindered(self) -> bool:
@@ -146,11 +147,6 @@ class Candidate:
         if self.significant:
             return not self.predicts and gain.t > UNEVENLY and self.beyond_slow_noise
         return gain.consistent and gain.total > MUCH * float(gain.before.sum())
-
-    @property
-    def _counts(self) -> bool:
-        """Whether it is significant, and no more of what is adopted or logged."""
-        return self.significant and self._more_than_known
 
     @property
     def _more_than_known(self) -> bool:

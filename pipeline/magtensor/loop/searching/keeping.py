@@ -8,7 +8,7 @@ from magtensor.error_models.excitation import Excitation
 from magtensor.error_models.settings import Range, profiled
 from magtensor.errors import DataError
 from magtensor.loop.fitting.log_noise import channels_of
-from magtensor.loop.fitting.model import Adopted, Fitting, Record
+from magtensor.loop.fitting.model import Adopted, Fitting, Record, State
 from magtensor.loop.fitting.trial import Trial, on_the_folds_of, trial
 from magtensor.loop.remainder.changing_matrix import channel_instead
 from magtensor.loop.remainder.curve_of_a_channel import event_of_a_curve
@@ -115,10 +115,8 @@ def why_not(record: Record, before: Trial, after: Trial, chosen: Candidate, how:
     theta = chosen.assessment.theta[-chosen.terms.count :]
     seen = chosen.before or before.state  # at the samples of its terms
     if happens_once(model):
-        others = replace(after.state, adopted=after.state.adopted[:which], theta=after.state.theta[:which])
-        own = model.terms(x).at(after.state.residual.samples)
-        # fitted alone the other had a part of it, and so its vectors
-        if (name := event_along(seen, chosen.terms, theta)) and event_along(others, own, after.state.theta[which]):
+        # fitted without it the other may have had a part of it, and so its vectors
+        if (name := event_along(seen, chosen.terms, theta)) and _along_another(after.state, which):
             return f"it lies along the vectors of {name}, whose law may leave it"
         if channel := event_of_a_curve(seen, chosen.terms, theta, chosen.assessment.colours):
             return f"a curve of {channel} explains most of it: what is adopted may miss its law"
@@ -128,6 +126,13 @@ def why_not(record: Record, before: Trial, after: Trial, chosen: Candidate, how:
         if better_left_out(record, before.state, after.state, which, how):
             return "fitted, its samples are far from its law: the others are fitted better without them"
     return ""
+
+
+def _along_another(state: State, which: int) -> bool:
+    """Whether an adopted event lies along the vectors of one of the models before it, all fitted together."""
+    others = replace(state, adopted=state.adopted[:which], theta=state.theta[:which])
+    own = state.adopted[which].terms(state.excitation).at(state.residual.samples)
+    return bool(event_along(others, own, state.theta[which]))
 
 
 def _shorter_than_shown(model: Adopted, x: Excitation) -> str:

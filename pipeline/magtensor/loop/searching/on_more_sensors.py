@@ -45,7 +45,7 @@ def on_more_sensors(record: Record, standing: Trial, how: Fitting, places: Seque
 
 def _that_may_show(state: State, place: int) -> list[str]:
     """The sensors that an adopted model was left out of, and no other one of its kind acts on, whose residual it
-    explains more of than white noise of the residual's colour would let it."""
+    explains more of than noise of the residual's colour would let it."""
     from scipy.special import chdtrc
 
     model, x = state.adopted[place], state.excitation

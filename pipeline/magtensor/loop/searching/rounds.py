@@ -196,10 +196,7 @@ class Rounds:
             possible = [c for c in left if c.predicts]
             best = containing(best, possible, before.state)
             chosen, rivals = simplest(best, possible, before.state)
-            if name := part_of_a_drift(chosen, candidates, before.state):
-                refuse(chosen.model.name, f"{name}, which lasts, predicts as much")
-                continue
-            if why := part_of_a_larger_law(chosen, before.state):
+            if why := self.of_another(chosen, candidates, before.state):
                 refuse(chosen.model.name, why)
                 continue
             chosen, channels = nearest(chosen, before.state, models)
@@ -215,9 +212,6 @@ class Rounds:
                 if channel not in asked:
                     asked.add(channel)
                     left += by_any_law_of(channel, before.state, self.open_models(before.state), self.alpha)
-                continue
-            if name := rate_instead(chosen, before.state, self.models):
-                refuse(chosen.model.name, f"{name}, for which the field turns too fast between samples, explains more")
                 continue
             rivals = tuple(sorted({*rivals, *as_predictive(chosen, candidates, before.state)}))
             if not time.seen:
@@ -253,6 +247,14 @@ class Rounds:
             return replace(tried, why=UNEARNED), ()
         return (replace(tried, after=trial(record, last, how)) if dropped else tried), dropped
 
+    def of_another(self, chosen: Candidate, candidates: Sequence[Candidate], state: State) -> str:
+        """Why a candidate, before it is fitted, is taken for a part of what another model explains; "" if it is not."""
+        if name := part_of_a_drift(chosen, candidates, state):
+            return f"{name}, which lasts, predicts as much"
+        if name := rate_instead(chosen, state, self.models):
+            return f"{name}, for which the field turns too fast between samples, explains more"
+        return part_of_a_larger_law(chosen, state)
+
     def kept_with_another(
         self,
         record: Record,
@@ -265,9 +267,7 @@ class Rounds:
         """One of the candidates that does not predict by itself, if it passes both gates beside what is found when it
         is in, and would not be refused as one that passes."""
         state = before.state
-        if beside_time(chosen, state).refused or part_of_a_larger_law(chosen, state):
-            return None
-        if part_of_a_drift(chosen, candidates, state) or rate_instead(chosen, state, self.models):
+        if self.of_another(chosen, candidates, state) or beside_time(chosen, state).refused:
             return None
         two = self.with_another(record, before, chosen, fitted_everywhere(record, before, chosen, how), how)
         if two is None or two.standing is None:

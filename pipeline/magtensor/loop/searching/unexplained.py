@@ -13,18 +13,18 @@ from typing import Any
 import numpy as np
 
 from magtensor.loop.evidence.own_noise import OwnNoise
-from magtensor.loop.evidence.residual import residual_of
+from magtensor.loop.evidence.residual import Residual, residual_of
 from magtensor.loop.evidence.spectrum import spectral_lines
 from magtensor.loop.evidence.stretches import ABOUT, LEAST_LOUD
 from magtensor.loop.fitting.model import Fitting, Record, State
 from magtensor.loop.fitting.refit import disturbed, without
 from magtensor.loop.remainder.changing_matrix import changing_matrices
 from magtensor.loop.remainder.flagged import (
+    ALIKE,
     after_pauses,
     beyond_the_reference,
     flagged_words,
     lasting,
-    seen_alike,
     unread_words,
 )
 from magtensor.loop.remainder.gradient_shape import MODEL, gradient_share
@@ -108,7 +108,7 @@ def _what_shows(found: Search, record: Record, excess: float, sparse: SparseRead
     noise = float(np.hypot(OwnNoise(state.residual, None).slow_along(), of_the_station(state, record)))
     noise = float(np.hypot(noise, sparse.between if sparse is not None else 0.0))
     if (slow := slow_along(state)) > max(MUCH * state.residual.scale, TWICE * noise):
-        alike = seen_alike(state.residual)
+        alike = _seen_alike(state.residual)
         where = "in all sensors alike" if alike else "in their mean"
         cause = ": an error of the base station, or a field at the site that it does not see" if alike else ""
         words.append(f"{slow:.3g} nT rms of |b| - F, {where}, is no white noise{cause}")
@@ -212,8 +212,19 @@ def _where(state: State) -> str:
     count = len(residual.along)
     between = float(np.sum(residual.across**2)) - count * (residual.freedom - 1)
     if float(np.sum(residual.along**2)) - count > max(between, 0.0):
-        return f"mostly in |b| - F{', alike in all sensors' * seen_alike(state.residual)}"
+        return f"mostly in |b| - F{', alike in all sensors' * _seen_alike(state.residual)}"
     return _on_sensors(state)
+
+
+def _seen_alike(residual: Residual) -> bool:
+    """Whether what a residual holds above the white noise is seen by all sensors alike, as far as they could differ."""
+    if residual.along is None:
+        return False
+    if residual.across is None:  # of one sensor
+        return True
+    own = np.mean((residual.across**2 - np.diagonal(residual.projector)) * residual.noise**2, axis=0)  # nT2
+    shared = np.mean((residual.along**2 - 1.0) / residual.reference_gain**2)
+    return bool(own.reshape(-1, 3).sum(axis=1).max() < ALIKE * shared)
 
 
 def _on_sensors(state: State) -> str:
