@@ -134,8 +134,9 @@ class Candidate:
     @property
     def predicts(self) -> bool:
         """Whether it is significant and predicts held-out blocks, in noise of the colour of what it leaves."""
-        evenly = self.assessment.gain.consistent or self.predicts_where_it_acts
-        return self.significant and self._more_than_known and evenly
+        if not self._more_than_known or not self.significant:
+            return False
+        return self.assessment.gain.consistent or self.predicts_where_it_acts
 
     @property
     def may_be_hindered(self) -> bool:
