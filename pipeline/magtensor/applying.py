@@ -99,6 +99,7 @@ def apply(
         "extrapolated": "extrapolated",
         "taken to go straight": "bridged",
         "begins anew with this survey": "begins_anew",
+        "otherwise than the dates say, as this survey's own outputs show": "not_as_dated",
         "taken to begin in equilibrium, which four sensors of known positions would show": "in_equilibrium",
         "NOT taken off, for the lengths of this survey's vectors refute it": "not_on_this_survey",
     }
@@ -183,6 +184,7 @@ def apply_and_refine(
         cleaned,
         extrapolated,
         in_equilibrium,
+        not_as_dated,
         on_its_clock,
         stored_effects,
         those_here,
@@ -228,6 +230,7 @@ def apply_and_refine(
             "extrapolated": extrapolated(before, calibration, adopted, origins),
             "bridged": bridged(before, adopted),
             "begins_anew": begun_anew(adopted, calibration),
+            "not_as_dated": not_as_dated(adopted, survey),
             "in_equilibrium": in_equilibrium(adopted, survey),
             "not_on_this_survey": here.refuted,
         }

@@ -17,6 +17,8 @@ MOTION = scenario()["motion"] | {"duration_s": 600.0}
 DRIFT = {"type": "offset_drift", "rms_nT": 0.6}
 FADING = {"type": "scale_drift", "rms_nT": 0.6}
 STEP = {"type": "offset_step", "time_s": [250.0], "nT": [[0.0] * 3, [0.6, -0.5, 0.8], [0.0] * 3, [0.0] * 3]}
+SLIP = {"type": "lag_step", "time_s": 250.0, "lag_s": [[0.0] * 3, [0.02] * 3, [0.0] * 3, [0.0] * 3]}
+RETUNED = {"type": "scale_step", "time_s": [250.0], "ppm": [[0.0] * 3, [20.0, -15.0, 25.0], [0.0] * 3, [0.0] * 3]}
 LATER = "2026-06-12T09:00:00Z"
 
 
@@ -76,6 +78,30 @@ def test_what_stays_does_not_begin_anew(tmp_path: Path, effect: dict[str, Any], 
     with h5py.File(bare, "r+") as file:
         file["b_raw"][...] += last + 0.3 * np.random.default_rng(seed).standard_normal(last.shape)
     assert "begins_anew" not in done.calibration.apply(bare)["calibrated/b"].attrs
+
+
+@pytest.mark.parametrize("effect", [STEP, RETUNED], ids=lambda e: str(e["type"]))
+@pytest.mark.parametrize(("at", "when"), [([0.1], "happened before"), ([], "not yet"), ([250.0], "")])
+def test_outputs_come_before_the_dates(tmp_path: Path, effect: dict[str, Any], at: list[float], when: str) -> None:
+    """A second survey on the clock of the first: its jump was at that time, or the clock was set back to it."""
+    done = found(tmp_path, effect)
+    there = survey_file(tmp_path, of_a_day(6, *([effect | {"time_s": at}] if at else [])), "there.h5")
+    b = done.calibration.apply(there)["calibrated/b"]
+    assert b.attrs.get("not_as_dated", "") == (f"{effect['type']} ({when})" if when else "")
+    with h5py.File(there) as file:
+        error = np.linalg.norm(b, axis=2) - file["truth/total_field_true"][()][:, None]
+    assert np.sqrt(np.mean(error**2)) < 0.17  # the noise is 0.15 nT; the jump moves |b| by 0.6 nT
+
+
+@pytest.mark.parametrize("again", [True, False])
+def test_a_slip_goes_on_where_the_outputs_show_it(tmp_path: Path, again: bool) -> None:
+    """Recorders begin in step on another day, but not all of them."""
+    done = found(tmp_path, SLIP)
+    there = survey_file(tmp_path, of_a_day(6, *([SLIP | {"time_s": 0.0}] if again else []), start=LATER), "there.h5")
+    b = done.calibration.apply(there)["calibrated/b"]
+    assert b.attrs.get("not_as_dated", "") == ("lag_step (happened before)" if again else "")
+    apart = b[:, 1] - b[:, [0, 2, 3]].mean(axis=1)
+    assert np.sqrt(np.mean(apart**2)) < 0.25  # of noise 0.17 nT; the slip makes some 150 nT
 
 
 @pytest.mark.long

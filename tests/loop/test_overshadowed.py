@@ -169,6 +169,36 @@ def test_a_source_in_the_place_of_a_step_may_cost_samples_that_do_not_make_it_be
     assert (found is not None) == kept
 
 
+def test_of_two_of_a_kind_one_may_have_taken_the_source_and_the_other_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A temperature through a lag that bends along the source's waveform, and the one that the sensors feel."""
+
+    def state(*lags: float) -> Any:
+        return SimpleNamespace(
+            adopted=[SimpleNamespace(name="temperature_offset", lag=lag) for lag in lags],
+            fit=SimpleNamespace(keep=np.ones(1000, dtype=bool)),
+            residual=SimpleNamespace(affine=np.ones((1000, 4))),
+        )
+
+    def without(_: Any, of: Any, places: list[int], how: Any) -> Any:
+        return state(*(a.lag for i, a in enumerate(of.adopted) if i not in places))
+
+    def tried(_: Any, record: Any, of: Any, *__: Any) -> tuple[None, Any]:
+        return None, SimpleNamespace(after=of) if [a.lag for a in of.adopted] != [] else None
+
+    monkeypatch.setattr(rounds, "without_models", without)
+    monkeypatch.setattr(rounds, "sought", lambda *_, **__: object())
+    monkeypatch.setattr(rounds, "tried_source", tried)
+    monkeypatch.setattr(rounds, "per_sample", lambda s: {(40.0,): 3.0, (-180.0,): 1.0}.get(_lags(s), 2.0))
+    left: Any = SimpleNamespace(left_by="temperature_offset", significant=False)
+    given: Any = None
+    found = rounds._source_instead(given, given, state(-180.0, 40.0), left, given, 0, 0.005)
+    assert found is not None and _lags(found.after) == (40.0,)
+
+
+def _lags(state: Any) -> tuple[float, ...]:
+    return tuple(a.lag for a in state.adopted)
+
+
 def test_a_response_to_the_acceleration_follows_the_attitude_through_any_lag(tmp_path: Path) -> None:
     logging = {"attitude": True, "acceleration": True}
     record = loaded(tmp_path, scenario(86, {"type": "offset_drift", "rms_nT": 1.0}, logging=logging))

@@ -1,5 +1,5 @@
 """What a survey began with and a calibration cannot know: the phase of a tone, the state of a response that lags, and
-whether what drifts or happens at a time goes on from the survey of the calibration or begins anew.
+from when the times of what drifts or happens count.
 
 All are found from the survey's own outputs, in what neither a uniform field nor a gradient can make of them, so that
 nothing a survey may be looking for is taken for an error of the instrument.
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from magtensor.calibration.by_sensor import by_sensor
 from magtensor.calibration.types import Array, ArrayCalibration
 from magtensor.error_models.excitation import Excitation
-from magtensor.error_models.settings import Beginning, profiled
+from magtensor.error_models.settings import Beginning, Duration, EventTimes, profiled
 from magtensor.loop.fitting.model import Adopted, Record
 from magtensor.tensor.geometry import array_design
 
@@ -24,7 +24,8 @@ TONE = "periodic_interference"
 LEAST_CONTRAST = 1e-4  # of an effect's own power, between the sensors
 SIGNIFICANT = 4.0  # standard deviations, of what is found on another survey
 LEAST_PARTS = 8  # of the survey, whose means tell how large slow noise is
-ANEW = 0.5  # of the difference between beginning anew and going on
+ANEW = 0.5  # of the difference between another start and the known one
+LONG = 1e11  # s, longer than any two surveys are apart
 
 
 def as_begun_here(
@@ -175,24 +176,45 @@ def _variance(noise: Array, course: Array, parts: int) -> float:
     return max(float(np.var(along)), float(np.var(means)) * len(along) / len(means))
 
 
-def begins_anew(
+def as_dated_here(
     record: Record, calibration: ArrayCalibration, own: Sequence[tuple[Adopted, Array]], number: int
-) -> bool:
-    """Whether an effect that is known to go with the time since the survey of the calibration began goes with the time
-    since this one did.
+) -> Adopted:
+    """An effect that is known to go with the time since the survey of the calibration began, as this survey shows it.
 
-    A drift of what is switched on with the survey, a jump at the same time of each. Beginning anew has to be nearer to
+    What the outputs say comes before the dates: a drift of what is switched on with the survey and a jump at the same
+    time of each begin anew, a jump was mended or is yet to come, or the clock was never set. That has to be nearer to
     the outputs, and its course to be seen in them whatever the offsets are, which differ from survey to survey. A
-    steady drift that goes on has the course too, and is elsewhere.
+    steady drift that goes on has the course of one that begins anew too, and is elsewhere.
     """
     model, theta = own[number]
-    if model.start in (None, record.start) or not shows_a_state(record.raw, record.position is not None):
-        return False
+    if model.start is None or not shows_a_state(record.raw, record.position is not None):
+        return model
     here = _Here.of(record, calibration)
-    course = here.added(replace(model, start=None), theta) - here.added(model, theta)
-    left = here.left(own)
-    if not len(left) or _part(left, course) <= ANEW:
-        return False
+    known, left = here.added(model, theta), here.left(own)
+    nearest, most = model, 0.0
+    for other in _otherwise(model, record):
+        course = here.added(other, theta) - known
+        nearer = 2.0 * float(np.sum(left * course)) - float(np.sum(course**2))
+        if nearer > most and _seen(left, course):
+            nearest, most = other, nearer
+    return nearest
+
+
+def _otherwise(model: Adopted, record: Record) -> list[Adopted]:
+    """An effect that begins anew with a survey, one that was over before it, and one that is yet to come.
+
+    A slip of a recorder, which ends with the survey as a rule, goes on where it was before.
+    """
+    marks = profiled(model.component).items()
+    lasts = [name for name, mark in marks if isinstance(mark, Duration)]
+    slips = lasts and any(isinstance(mark, EventTimes) for _, mark in marks)
+    goes_on = dict.fromkeys(lasts, 3.0 * LONG) if slips else {}
+    before = replace(model, start=float(record.time[0]) - LONG, settings={**model.settings, **goes_on})
+    return [replace(model, start=None), before, replace(model, start=float(record.time[-1]) + LONG)]
+
+
+def _seen(left: Array, course: Array) -> bool:
+    """Whether more than half of a course (n, 3 S) is in what is left, whatever the offsets are."""
     left, course = left - left.mean(axis=0), course - course.mean(axis=0)
     part = _part(left, course)
     variance = _variance(left - part * course, course, LEAST_PARTS)

@@ -16,7 +16,7 @@ from magtensor.error_models.needs import FACTS
 from magtensor.error_models.settings import NOT_KNOWN, AnyChannel, Beginning, Duration, EventTimes, profiled
 from magtensor.error_models.waveform import NAME
 from magtensor.errors import DataError, UsageError
-from magtensor.loop.correcting.another_survey import TONE, begins_anew, shows_a_state, unknown
+from magtensor.loop.correcting.another_survey import LONG, TONE, as_dated_here, shows_a_state, unknown
 from magtensor.loop.correcting.correction import corrected_raw, corrected_reference, hidden_objection
 from magtensor.loop.correcting.lengths import AVERAGING, averaged_otherwise
 from magtensor.loop.fitting.model import Adopted, Record, unread
@@ -98,8 +98,9 @@ def on_its_clock(
 ) -> list[Adopted]:
     """Effects of a calibration as they are on another survey: what happened at a time has happened since then.
 
-    A jump stays, and a drift holds its last value, unless the survey's own outputs show that it begins anew. Warming up
-    does with every survey, and what a lagged response began with is another survey's own.
+    A jump stays, and a drift holds its last value, unless the survey's own outputs show that it begins anew, was over
+    before or is yet to come. Warming up begins with every survey, and what a lagged response began with is another
+    survey's own.
     """
     begun = calibration["calibration/effects"].attrs.get("start") if adopted else None
     if begun is None:
@@ -112,8 +113,8 @@ def on_its_clock(
     own = [i for i, a in enumerate(known) if a.component.effect == "instrument" and not _lacking(a, record)]
     own = [i for i in own if known[i].name != NAME]  # its waveform here is found when the others are taken off
     effects = [(known[i], theta[i]) for i in own]
-    anew = {i for i in dated if i in own and begins_anew(record, fitted, effects, own.index(i))}
-    return [replace(a, start=None) if i in anew else a for i, a in enumerate(known)]
+    here = {i: as_dated_here(record, fitted, effects, own.index(i)) for i in dated if i in own}
+    return [here.get(i, a) for i, a in enumerate(known)]
 
 
 def begun_anew(adopted: Sequence[Adopted], calibration: Survey) -> str:
@@ -121,6 +122,14 @@ def begun_anew(adopted: Sequence[Adopted], calibration: Survey) -> str:
     if not adopted or "start" not in calibration["calibration/effects"].attrs:  # nothing says when that was
         return ""
     return ", ".join(dict.fromkeys(a.name for a in adopted if _of_a_time(a) and a.start is None))
+
+
+def not_as_dated(adopted: Sequence[Adopted], survey: Survey) -> str:
+    """Which effects that go with time had happened before a survey, or not yet in it, where the dates say otherwise;
+    "" where none is."""
+    late = {a.name: (a.start or 0.0) - float(survey.time[0]) for a in adopted if a.start is not None}
+    words = {n: "happened before" if s < 0 else "not yet" for n, s in late.items() if abs(s) >= LONG}
+    return ", ".join(f"{name} ({when})" for name, when in words.items())
 
 
 def in_equilibrium(adopted: Sequence[Adopted], survey: Survey) -> str:

@@ -75,21 +75,21 @@ def containing(best: Candidate, possible: Sequence[Candidate], state: State) -> 
 
 
 def as_predictive(chosen: Candidate, candidates: Sequence[Candidate], state: State) -> set[str]:
-    """Names of the models that predict held-out blocks better than the chosen one and leave it next to nothing, though
+    """Names of the models that predict held-out blocks as well as the chosen one and leave it next to nothing, though
     they are not significant for all that was tried of them.
 
-    What has no settings needs no correction for them, and is significant first, whatever the cause: a base station's
-    variation that is larger than the site's before a jump of it, which may have been at any time.
+    What has few settings needs less correction for them, and is significant first, whatever the cause: a base station's
+    variation that is larger than the site's before a jump of it, which may have been at any time; a supply's voltage
+    before a temperature that may act late.
     """
 
-    def does_better(other: Candidate) -> bool:
-        gain = other.assessment.gain
-        if other.significant or not gain.consistent or gain.total <= chosen.assessment.gain.total:
+    def does_as_well(other: Candidate) -> bool:
+        if other.significant or not other.assessment.gain.consistent:
             return False
         whole, own, both = _beside(chosen, other, state)
-        return own <= whole and both - whole < SMALL_PART * own
+        return own - whole < SEPARATION and both - whole < SMALL_PART * own
 
-    return {c.model.name for c in candidates if c.model.name != chosen.model.name and does_better(c)}
+    return {c.model.name for c in candidates if c.model.name != chosen.model.name and does_as_well(c)}
 
 
 def hindered_by_another(best: Candidate | None, candidates: Sequence[Candidate], state: State) -> Candidate | None:

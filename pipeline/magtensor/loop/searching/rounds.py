@@ -377,16 +377,18 @@ def _source_instead(
     left: what the effect leaves.
     """
     places = [i for i, a in enumerate(state.adopted) if a.name == left.left_by and i >= fixed]
-    if not places:
-        return None
-    less = without_models(record, state, places, how)
-    tried = left.significant and all(generic(state.adopted[i]) for i in places)
-    shared = sought(less, record, may_follow=tried)
-    source = None if shared is None else tried_source(component, record, less, shared, how, alpha)[1]
-    if source is None:
-        return None
-    lost = max(int(state.fit.keep.sum() - source.after.fit.keep.sum()), 0) / len(state.residual.affine)
-    return source if per_sample(source.after) > per_sample(state) + MOST_OF_A_SAMPLE * lost else None
+    one_each = [[i] for i in places] if len(places) > 1 else []  # the other may be there
+    found: list[Source] = []
+    for gone in ([places] if places else []) + one_each:
+        less = without_models(record, state, gone, how)
+        tried = left.significant and all(generic(state.adopted[i]) for i in gone)
+        shared = sought(less, record, may_follow=tried)
+        source = None if shared is None else tried_source(component, record, less, shared, how, alpha)[1]
+        if source is not None:
+            lost = max(int(state.fit.keep.sum() - source.after.fit.keep.sum()), 0) / len(state.residual.affine)
+            if per_sample(source.after) > per_sample(state) + MOST_OF_A_SAMPLE * lost:
+                found.append(source)
+    return max(found, key=lambda source: per_sample(source.after), default=None)
 
 
 @dataclass(frozen=True)
