@@ -72,14 +72,15 @@ def frame_flexure(
     typical="14.5 nT for 1 arcmin in 50 000 nT",
     pointwise=True,
 )
-def turn_step(x: Excitation, *, time_s: EventTime = 0.0) -> Terms:
+def turn_step(x: Excitation, *, time_s: EventTime = 0.0, angles: Angles = 3) -> Terms:
     """Each sensor turns in its mount at a time: a knock, a screw that gave way.
 
-    C (b x e) from the time on: three coefficients a sensor, the angles about x, y and z of the platform. Several
+    C (b x e) from the time on: three coefficients a sensor, the angles about x, y and z of the platform; with six
+    angles also the symmetric part, as of `temperature_alignment`: iron that was moved, a core that has slipped. Several
     knocks are several models of this name. A turn common to all sensors is not visible without a vector reference.
     Rivals: `scale_step` and `offset_step` where the attitude hardly changes.
     """
-    return joined(_by_an_arcmin(x, (x.elapsed >= time_s).astype(float), "arcmin", 3))
+    return joined(_by_an_arcmin(x, (x.elapsed >= time_s).astype(float), "arcmin", angles))
 
 
 @error_model(

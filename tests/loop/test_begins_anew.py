@@ -18,6 +18,7 @@ DRIFT = {"type": "offset_drift", "rms_nT": 0.6}
 FADING = {"type": "scale_drift", "rms_nT": 0.6}
 STEP = {"type": "offset_step", "time_s": [250.0], "nT": [[0.0] * 3, [0.6, -0.5, 0.8], [0.0] * 3, [0.0] * 3]}
 SLIP = {"type": "lag_step", "time_s": 250.0, "lag_s": [[0.0] * 3, [0.02] * 3, [0.0] * 3, [0.0] * 3]}
+WARMING = {"type": "warm_up", "tau_s": 120.0, "nT": [[0.0] * 3, [2.0, -1.5, 1.0], [0.0] * 3, [0.0] * 3]}
 RETUNED = {"type": "scale_step", "time_s": [250.0], "ppm": [[0.0] * 3, [20.0, -15.0, 25.0], [0.0] * 3, [0.0] * 3]}
 LATER = "2026-06-12T09:00:00Z"
 
@@ -102,6 +103,18 @@ def test_a_slip_goes_on_where_the_outputs_show_it(tmp_path: Path, again: bool) -
     assert b.attrs.get("not_as_dated", "") == ("lag_step (happened before)" if again else "")
     apart = b[:, 1] - b[:, [0, 2, 3]].mean(axis=1)
     assert np.sqrt(np.mean(apart**2)) < 0.25  # of noise 0.17 nT; the slip makes some 150 nT
+
+
+@pytest.mark.parametrize("switched_on_s", [-1e5, -110.0, 0.0])
+def test_what_was_switched_on_before_is_warm(tmp_path: Path, switched_on_s: float) -> None:
+    done = found(tmp_path, WARMING)
+    before = WARMING | {"switched_on_s": switched_on_s}
+    there = survey_file(tmp_path, of_a_day(6, before, start=LATER), "there.h5")
+    b = done.calibration.apply(there)["calibrated/b"]
+    with h5py.File(there) as file:
+        error = np.linalg.norm(b[:, 1], axis=1) - file["truth/total_field_true"][()]
+    assert np.sqrt(np.mean(error[:240] ** 2)) < 0.17  # of noise 0.15 nT; the warming up makes 1.0 nT of |b| there
+    assert "not_as_dated" not in b.attrs and "begins_anew" not in b.attrs
 
 
 @pytest.mark.long

@@ -48,6 +48,19 @@ def test_slow_noise_is_no_effect_but_its_amount_is_told() -> None:
     assert unexplained(search(quiet, [], Fitting()), quiet)["description"] == NOISE
 
 
+def test_slow_noise_of_one_sensor_is_told_where_the_others_hide_it_in_the_sum() -> None:
+    """Random telegraph noise of an axis: two levels, some 40 s each."""
+    rng = np.random.default_rng(16)
+    added = np.zeros((2400, 4, 3))
+    added[:, 2, 1] = np.where(np.cumsum(rng.random(2400) < 1 / 40) % 2, 2.0, -2.0)
+    record = synthetic(6, added=added, samples=2400)
+    told = unexplained(search(record, [], Fitting()), record)
+    assert not told["present"]
+    amount = re.fullmatch(rf"{NOISE}; as vectors ([\d.]+) nT rms of S3 are slow noise", told["description"])
+    # three quarters of its power lie across the plane of the field that all sensors see, before C takes its share
+    assert amount and float(amount[1]) == pytest.approx(2.0 * np.sqrt(0.75), rel=0.15)
+
+
 @pytest.mark.parametrize(("share", "told"), [(0.01, False), (0.5, True)])
 def test_a_small_waveform_that_predicts_nothing_is_not_told(share: float, told: bool) -> None:
     """Noise that grows louder makes one by chance."""

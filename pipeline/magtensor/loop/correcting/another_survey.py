@@ -21,6 +21,7 @@ from magtensor.loop.fitting.model import Adopted, Record
 from magtensor.tensor.geometry import array_design
 
 TONE = "periodic_interference"
+WARM_UP = "warm_up"  # begins with every survey, warmer in one than in another
 LEAST_CONTRAST = 1e-4  # of an effect's own power, between the sensors
 SIGNIFICANT = 4.0  # standard deviations, of what is found on another survey
 LEAST_PARTS = 8  # of the survey, whose means tell how large slow noise is
@@ -33,6 +34,9 @@ def as_begun_here(
 ) -> list[tuple[Adopted, Array]]:
     """Effects with their coefficients, as they are on a survey that began otherwise than the calibration's."""
     begun = [(a, _tone_here(record, calibration, a, t) if a.name == TONE else t) for a, t in own]
+    begun = [
+        (a, _warmth_here(record, calibration, begun, i) if a.name == WARM_UP else t) for i, (a, t) in enumerate(begun)
+    ]
     for number, (model, theta) in enumerate(begun):
         names = unknown(model)
         if names:
@@ -95,6 +99,25 @@ def _tone_here(record: Record, calibration: ArrayCalibration, model: Adopted, th
     own = np.linalg.lstsq(both, contrast(raw - calibration.offset).ravel(), rcond=1e-6)[0]
     out: Array = own[0] * theta + own[1] * later
     return out
+
+
+def _warmth_here(
+    record: Record, calibration: ArrayCalibration, own: Sequence[tuple[Adopted, Array]], number: int
+) -> Array:
+    """Coefficients of a warming up as far as it had come when this survey began: the same course, in another strength.
+
+    None is left of what was switched on long before. By what the outputs show of the course whatever the offsets are;
+    where that is not known from noise, it is as it was.
+    """
+    model, theta = own[number]
+    if not shows_a_state(record.raw, record.position is not None):
+        return theta
+    here = _Here.of(record, calibration)
+    left, course = here.left(own), here.added(model, theta)
+    if not len(left):
+        return theta
+    part, known = _seen(left, course)
+    return max(1.0 + part, 0.0) * theta if known else theta
 
 
 def shows_a_state(raw: Array, positions_known: bool) -> bool:
@@ -190,12 +213,13 @@ def as_dated_here(
     if model.start is None or not shows_a_state(record.raw, record.position is not None):
         return model
     here = _Here.of(record, calibration)
-    known, left = here.added(model, theta), here.left(own)
+    dated, left = here.added(model, theta), here.left(own)
     nearest, most = model, 0.0
     for other in _otherwise(model, record):
-        course = here.added(other, theta) - known
+        course = here.added(other, theta) - dated
         nearer = 2.0 * float(np.sum(left * course)) - float(np.sum(course**2))
-        if nearer > most and _seen(left, course):
+        part, known = _seen(left, course)
+        if nearer > most and part > ANEW and known:
             nearest, most = other, nearer
     return nearest
 
@@ -213,15 +237,10 @@ def _otherwise(model: Adopted, record: Record) -> list[Adopted]:
     return [replace(model, start=None), before, replace(model, start=float(record.time[-1]) + LONG)]
 
 
-def _seen(left: Array, course: Array) -> bool:
-    """Whether more than half of a course (n, 3 S) is in what is left, whatever the offsets are."""
+def _seen(left: Array, course: Array) -> tuple[float, bool]:
+    """How much of a course (n, 3 S) there is in what is left, whatever the offsets are, and whether noise is less."""
     left, course = left - left.mean(axis=0), course - course.mean(axis=0)
-    part = _part(left, course)
-    variance = _variance(left - part * course, course, LEAST_PARTS)
-    return part > ANEW and part**2 * float(np.sum(course**2)) > SIGNIFICANT**2 * variance
-
-
-def _part(left: Array, course: Array) -> float:
-    """How much of a course (n, 3 S) there is in what is left, by least squares."""
     power = float(np.sum(course**2))
-    return float(np.sum(left * course)) / power if power > 0 else 0.0
+    part = float(np.sum(left * course)) / power if power > 0 else 0.0
+    variance = _variance(left - part * course, course, LEAST_PARTS)
+    return part, part**2 * power > SIGNIFICANT**2 * variance

@@ -41,21 +41,22 @@ def explained_beside(state: State, terms: Terms, assessment: Assessment) -> floa
 
 def explained_by_kin(state: State, model: Adopted, terms: Terms, assessment: Assessment) -> float:
     """Sum of squares that adopted effects of another name explain which have the candidate's sensors and driver."""
-    return _explained(state, drivers(model, state.excitation), model.name, terms, assessment)
+    return _explained(state, drivers(model, state.excitation), model, terms, assessment)
 
 
 def explained_by_courses(state: State, candidate: Candidate) -> float:
     """Sum of squares that adopted effects explain which go with time and have the candidate's sensors."""
-    return _explained(state, {TIME}, candidate.model.name, candidate.terms, candidate.assessment)
+    return _explained(state, {TIME}, candidate.model, candidate.terms, candidate.assessment)
 
 
-def _explained(state: State, by: set[str], name: str, terms: Terms, assessment: Assessment) -> float:
+def _explained(state: State, by: set[str], model: Adopted, terms: Terms, assessment: Assessment) -> float:
     theta = assessment.estimate.theta[-terms.count :]
     between = seen_between(state.residual, terms, theta)  # where nothing of the reference is
     kin = [
         place
         for place, other in enumerate(state.adopted)
-        if other.name != name
+        if other.name != model.name
+        and not _same_moment(model, other, state.excitation)
         and not (between and other.component.effect == "reference")
         and by & drivers(other, state.excitation)
         and _held_by(other.sensors or state.excitation.sensors, state, terms, assessment) > NEARLY_ALL
@@ -67,6 +68,19 @@ def drivers(model: Adopted, x: Excitation) -> set[str]:
     """The channels that a model follows, and `TIME` of what drifts, warms up or happens once."""
     found = channels_of(model, x) | {need for need in model.component.declared({}).needs if need in x.logged}
     return found | ({TIME} if any(map(_of_time, profiled(model.component).values())) else set())
+
+
+def _same_moment(model: Adopted, other: Adopted, x: Excitation) -> bool:
+    """Whether two events happened between the same samples: a jump of C is one of its scale factors and one of its
+    angles, and what one leaves there the other explains exactly."""
+    mine, theirs = (np.searchsorted(x.elapsed, _moments(m)) for m in (model, other))
+    return mine.size > 0 and mine.shape == theirs.shape and bool(np.all(mine == theirs))
+
+
+def _moments(model: Adopted) -> list[float]:
+    """s, when it happened."""
+    marks = profiled(model.component).items()
+    return sorted(float(model.settings[name]) for name, mark in marks if isinstance(mark, EventTimes))
 
 
 def _of_time(grid: Any) -> bool:

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from magtensor.calibration.types import Array
 from magtensor.loop.evidence.own_noise import OwnNoise
 from magtensor.loop.evidence.residual import Residual, residual_of
 from magtensor.loop.evidence.spectrum import spectral_lines
@@ -123,6 +124,12 @@ def noise_words(state: State, record: Record) -> list[str]:
         slow = white * max(float(np.sum(residual.across**2)) / values - 1.0, 0.0) ** 0.5
         if slow > white:
             words.append(f"{slow:.3g} nT rms is not white, {_on_sensors(state)}")
+        else:
+            sensors, axis = state.excitation.sensors, np.sqrt(np.mean(residual.noise.reshape(-1, 3) ** 2, axis=1))
+            each = zip(sensors, np.sqrt(np.maximum(_beyond_white(residual), 0.0)), axis, strict=True)
+            slower = [f"{slow:.2g} nT rms of {name}" for name, slow, least in each if slow > least]
+            if 0 < len(slower) < len(sensors):
+                words.append(f"as vectors {' and '.join(slower)} are slow noise")
     if (slow := slow_along(state)) > white:
         station = of_the_station(state, record)
         makes = "may make all" if station > slow else f"makes {station:.2g} nT"  # known from how its readings scatter
@@ -222,9 +229,16 @@ def _seen_alike(residual: Residual) -> bool:
         return False
     if residual.across is None:  # of one sensor
         return True
-    own = np.mean((residual.across**2 - np.diagonal(residual.projector)) * residual.noise**2, axis=0)  # nT2
     shared = np.mean((residual.along**2 - 1.0) / residual.reference_gain**2)
-    return bool(own.reshape(-1, 3).sum(axis=1).max() < ALIKE * shared)
+    return bool(_beyond_white(residual).max() < ALIKE * shared)
+
+
+def _beyond_white(residual: Residual) -> Array:
+    """(S,) nT2, mean square of the vectors of each sensor across the plane, less that of white noise."""
+    assert residual.across is not None
+    own = np.mean((residual.across**2 - np.diagonal(residual.projector)) * residual.noise**2, axis=0)
+    out: Array = own.reshape(-1, 3).sum(axis=1)
+    return out
 
 
 def _on_sensors(state: State) -> str:
