@@ -7,9 +7,13 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from loop_cases import scenario, verdict_of
+from loop_cases import BASE, RECIPE, scenario, survey_file, verdict_of
 
 from magtensor.error_models.held_logs import unheld
+from magtensor.preparing import empty_survey
+from magtensor.recipe.plan import read_plan
+from magtensor.runner import run
+from magtensor.verdict import verdict
 
 HELD = 60  # samples of half a second
 TIME = np.arange(3000) * 0.5
@@ -73,3 +77,42 @@ def test_a_temperature_offset_keeps_its_lag_and_needs_no_helper(held: bool, tmp_
     told = verdict_of(tmp_path, scenario(51, effect), hold if held else None, models)
     assert [a["error_model"] for a in told["adopted"]] == ["temperature_offset"]
     assert told["adopted"][0]["settings"]["lag_s"] == pytest.approx(50.0, abs=10.0)
+
+
+@pytest.mark.parametrize("every", [2, 12, 60])
+def test_a_log_in_rows_of_its_own_is_searched(tmp_path: Path, every: int) -> None:
+    """A thermometer that is read seldom, in a table that has a row for every sample: the others are empty."""
+
+    def sparse(path: Path) -> None:
+        with h5py.File(path, "r+") as file:
+            values = file["temperature"][()]
+            values[np.arange(len(values)) % every > 0] = np.nan
+            file["temperature"][...] = values
+
+    effect = {"type": "temperature_offset", "rms_nT": 0.5, "sensors": ["S2"]}
+    models = ["temperature_offset", "channel_response", "latent_source", "offset_drift"]
+    found = verdict_of(tmp_path, scenario(61, effect), sparse, models)
+    assert [(a["error_model"], a["sensors"]) for a in found["adopted"]] == [("temperature_offset", ["S2"])]
+    assert not found["unexplained"]["present"]
+    assert "not searched" not in found["unexplained"]["description"]
+
+
+@pytest.mark.parametrize(
+    ("read", "searched"),
+    [
+        (slice(None, None, 60), True),
+        (slice(0, 1100), False),  # and then the thermometer was off
+        (slice(None, None, 800), False),  # four readings are no course
+    ],
+)
+def test_a_channel_that_most_of_the_survey_lacks_is_told(tmp_path: Path, read: slice, searched: bool) -> None:
+    values = np.full(len(TIME), np.nan)
+    values[read] = course(TIME)[read]
+    path = survey_file(tmp_path, scenario(62, motion=BASE["motion"] | {"duration_s": 1500.0}))
+    with h5py.File(path, "r+") as file:
+        file["temperature"][...] = values
+    planned = read_plan(RECIPE, survey=path, overrides=["stages.close_loop.search=[temperature_offset]"])
+    found = verdict(run(planned, empty_survey(planned)).survey)
+    said = "not searched, for most of the survey lacks it: temperature"
+    assert (said in found["unexplained"]["description"]) is not searched
+    assert [n["error_model"] for n in found["not_tested"]] == ([] if searched else ["temperature_offset"])

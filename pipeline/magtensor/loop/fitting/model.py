@@ -40,6 +40,7 @@ class Record:
         waveform: (N,) of a source that nobody logged, once it was found.
         station: the base station's own readings without their noise; None where only `total_field` is known.
         courses: of its thermometers, as in Excitation.
+        absent: names of channels that are missing too often to be searched.
     """
 
     time: Array
@@ -59,6 +60,7 @@ class Record:
     waveform: Array | None = None
     station: Station | None = None
     courses: dict[str, tuple[Array, Array]] = field(default_factory=dict, compare=False, repr=False)
+    absent: tuple[str, ...] = ()
 
     def at(self, keep: NDArray[np.int_]) -> Record:
         """Some of the samples."""

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from magtensor.between_readings import COURSES
 from magtensor.calibration.types import Array
+from magtensor.error_models.held_logs import LEAST_HELD, LEAST_READINGS
 from magtensor.error_models.quiet import quieted
 from magtensor.error_models.station import Station
 from magtensor.loop.fitting.model import Record
@@ -24,6 +25,7 @@ CLEARANCE = 10.0  # the reference's noise is in the residual too: what held it w
 GAP = 5.0  # median steps: a longer one begins a new run
 FURTHER_APART = 1.5  # median steps of the base station
 FEW = 0.05  # of the samples
+MOSTLY = 0.5  # of the samples: a channel that is known at fewer is not searched
 
 
 def record_of(
@@ -55,12 +57,15 @@ def record_of(
             use &= np.isfinite(total_field)
             use = _where_read(use, time, station)
     logged, units = channels_of(survey)
+    absent = []
     for name, values in list(logged.items()):
         finite = np.asarray(np.isfinite(values.reshape(len(values), -1)).all(axis=1))
-        if (finite[use].mean() if use.any() else 0.0) < 0.5:
-            del logged[name]  # hardly ever there
-        elif not finite.all():
-            logged[name] = _filled(time, values, finite)
+        if not finite.all():
+            if _known(time, finite)[use].sum() < MOSTLY * max(use.sum(), 1):
+                absent.append(name)
+                del logged[name]
+            else:
+                logged[name] = _filled(time, values, finite)
     keep = np.flatnonzero(use)
     if origins is None:
         origins = {name: origin(values[keep], units[name]) for name, values in logged.items()}
@@ -84,6 +89,7 @@ def record_of(
         position=np.asarray(survey.values("position"), dtype=float) if "position" in survey else None,
         attitude=np.asarray(survey.values("attitude"), dtype=float) if "attitude" in survey else None,
         samples=np.arange(len(time)),
+        absent=tuple(absent),
     )
     return whole if len(keep) == len(time) else whole.at(keep)
 
@@ -167,8 +173,24 @@ def _quiet(station: Station | None, time: Array, total_field: Array | None) -> A
     return np.where(np.isfinite(total_field), station.at(time), np.nan)
 
 
+def _known(time: Array, finite: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """(N,) whether a channel that is missing at some samples is known at each: read there, or at the usual interval
+    around it; at none where that is too seldom for a course."""
+    at = time[finite]
+    if len(at) < LEAST_READINGS:
+        return np.zeros(len(time), dtype=bool)
+    edges = np.concatenate([[-np.inf], at, [np.inf]])
+    after = np.clip(np.searchsorted(edges, time), 1, len(edges) - 1)
+    nearest = np.minimum(time - edges[after - 1], edges[after] - time)
+    return finite | (nearest <= np.median(np.diff(at)))
+
+
 def _filled(time: Array, values: Array, finite: NDArray[np.bool_]) -> Array:
-    """Missing values of a channel from their neighbours in time."""
+    """Missing values of a channel from their neighbours in time; of one that is read seldom the last reading, as a log
+    that is written with every sample holds it."""
     flat = values.reshape(len(values), -1)
+    if finite.sum() * LEAST_HELD <= len(values):
+        last = np.maximum.accumulate(np.where(finite, np.arange(len(values)), np.argmax(finite)))
+        return flat[last].reshape(values.shape)
     out = np.column_stack([np.interp(time, time[finite], column[finite]) for column in flat.T])
     return out.reshape(values.shape)

@@ -72,6 +72,8 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
         words.insert(0, size if excess else "in sum no more than the white noise")
     beside += [sparse.words] if sparse is not None else suspects.noise_words
     beside += suspects.small_words
+    if record.absent:
+        beside.append(f"not searched, for most of the survey lacks it: {', '.join(record.absent)}")
     if flagged.any():
         left_out, noise = flagged_words(flagged, state, record, sparse)
         (beside if noise and not paused else words).append(left_out + paused)
