@@ -6,14 +6,17 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import pytest
-from loop_cases import linear_state, loaded, scenario, synthetic
+from loop_cases import linear_state, loaded, scenario, synthetic, verdict_of
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
-from magtensor.loop.remainder.gradient_shape import gradient_share
+from magtensor.loop.remainder.gradient_shape import gradient_share, only_of_a_gradient
 
 Array = NDArray[np.float64]
+TILTED = {"type": "limited_tilt", "duration_s": 1200.0, "tilt_deg": 40.0}
 CROSS = np.array([[0.3, 0, 0], [-0.3, 0, 0], [0, 0.3, 0], [0, -0.3, 0]])
 
 
@@ -74,3 +77,39 @@ def test_arrays_that_cannot_tell(position: Array | None) -> None:
 def test_effects_of_a_simulated_survey(effect: dict[str, Any], shaped: bool, tmp_path: Path) -> None:
     record = loaded(tmp_path, scenario(5, effect))
     assert (gradient_share(linear_state(record), record.position) > 0.9) is shaped
+
+
+def with_a_compass(path: Path) -> None:
+    """A heading in the place of the attitude."""
+    with h5py.File(path, "r+") as file:
+        ahead = Rotation.from_quat(file["attitude"][()]).apply([1.0, 0.0, 0.0])
+        del file["attitude"]
+        file["heading"] = np.degrees(np.arctan2(ahead[:, 0], ahead[:, 1])) % 360.0
+        file["heading"].attrs["units"] = "degree"
+
+
+@pytest.mark.parametrize("effect", ["site_gradient", "temperature_scale"])
+def test_a_compass_does_not_stand_for_the_attitude(tmp_path: Path, effect: str) -> None:
+    """Of what a gradient of the site does a heading predicts a part."""
+    models = ["site_gradient", "channel_response", "moving_part", "temperature_scale"]
+    made = scenario(5, {"type": effect, "rms_nT": 0.6}, logging={"attitude": True}, motion=TILTED)
+    told = verdict_of(tmp_path, made, with_a_compass, models)
+    if effect == "site_gradient":
+        refused = {name: why for step in told["steps"] for name, why in step["refused"].items()}
+        assert "lacks the attitude" in refused["channel_response"]
+        assert not told["adopted"] and told["unexplained"]["looks_like"][0] == "site_gradient"
+    else:
+        assert [a["error_model"] for a in told["adopted"]] == [effect]
+
+
+def test_an_error_of_sensors_is_more_than_a_gradient_of_which_more_is_left() -> None:
+    rng = np.random.default_rng(8)
+    gradient = drawn(rng, CROSS)
+    record = replace(synthetic(3, added=gradient), position=CROSS)
+    some, own = 0.1 * gradient, np.zeros_like(gradient)
+    own[:, 1] = 0.5 * np.sin(np.arange(1200) / 80.0)[:, None]
+    for part, only in ((some, True), (own, False)):
+        with_it = linear_state(replace(record, raw=record.raw + part))
+        assert only_of_a_gradient(with_it, CROSS, linear_state(record).residual) is only
+    alone = linear_state(replace(synthetic(3, added=some + own), position=CROSS))
+    assert not only_of_a_gradient(alone, CROSS, linear_state(synthetic(3)).residual)

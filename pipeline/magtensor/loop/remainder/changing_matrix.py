@@ -29,6 +29,7 @@ COSINES = 4  # over the survey: slower than any block is long
 BLOCKS = 40  # longer than what noise can be expected to remember beyond its fitted colour
 LEAST_SAMPLES = 120  # three in a block
 SLOW = "cosines"
+JUMP = " jump"  # no channel has that name
 
 
 @dataclass(frozen=True)
@@ -78,11 +79,16 @@ def changing_matrices(state: State, alpha: float) -> list[ChangingMatrix]:
     return found
 
 
-def channel_instead(state: State, terms: Terms, colours: Colours) -> str:
+def channel_instead(state: State, terms: Terms, colours: Colours, since_s: float) -> str:
     """The logged channel whose product with the field, in matrices of the same sensors, explains far more than terms
-    (at the residual's samples) do; "" where none does.
+    (at the residual's samples) of something that happened do, and than matrices that jumped then; "" where none does.
 
     A mount that turns with temperature looks like one that jumped. Blocks that lie between others tell the two apart.
+    Of a jump of the whole matrix a model knows a part; anything that rises steadily, a counter of the samples, follows
+    more of it.
+
+    Args:
+        since_s: s after the survey's start, when it happened.
     """
     residual, x = state.residual, state.excitation
     numbers = [i for i, s in enumerate(x.sensors) if s in terms.sensors]
@@ -96,10 +102,12 @@ def channel_instead(state: State, terms: Terms, colours: Colours) -> str:
         given = np.arange(blocks.count) < blocks.count - more.count
         return interleaved_gain(blocks, residual.freedom, given, np.ones(blocks.count, dtype=bool)).total
 
+    channels[JUMP] = (x.elapsed >= since_s).astype(float)[:, None, None]
     products = {n: joined([_products(x, i, w) for i in numbers]).at(residual.samples) for n, w in channels.items()}
     gains = {name: gain(more) - more.count for name, more in products.items()}
+    jumped = max(gains.pop(JUMP), gain(terms))
     best = max(gains, key=lambda name: gains[name])
-    return best if gains[best] > gain(terms) + SEPARATION else ""
+    return best if gains[best] > jumped + SEPARATION else ""
 
 
 def waveforms_of(x: Excitation) -> dict[str, Array]:

@@ -11,6 +11,7 @@ import numpy as np
 
 from magtensor.calibration.joint import nearest_frame
 from magtensor.calibration.types import Array
+from magtensor.loop.evidence.residual import Residual
 from magtensor.loop.fitting.model import State
 
 MODEL = "site_gradient"
@@ -18,6 +19,8 @@ MOST_OUTSIDE = 0.1  # of the variance of each of its directions: what any other 
 LEAST_SECOND = 0.05  # of the strongest direction: a single waveform of any source has but one
 CLEARLY = 5.0  # times the variance of any other direction, where the noise is not known
 BEYOND_CHANCE = 5.0  # standard deviations of the white noise's own variance
+MOST = 0.5  # of what is left above the white noise
+HARDLY = 0.5  # of what an error of sensors has of other shapes
 _RANK = 1e-6
 
 
@@ -37,10 +40,7 @@ def gradient_share(state: State, position: Array | None) -> float:
     residual = state.residual
     if position is None or residual.across is None:
         return 0.0
-    forward = state.fit.forward @ nearest_frame(state.fit.forward)
-    shown = np.einsum("sij,kjl,sl->sik", forward, _symmetric(), position - position.mean(0)).reshape(-1, 5)
-    directions, size, _ = np.linalg.svd(residual.projector @ (shown / residual.noise[:, None]), full_matrices=False)
-    directions = directions[:, size > _RANK * size[0]] if size[0] > 0 else directions[:, :0]
+    directions = _directions(state, position)
     most, held = len(residual.noise) - 3, directions.shape[1]
     n, spent = residual.affine.shape
     if not 1 < held < most or n <= spent:
@@ -58,6 +58,36 @@ def gradient_share(state: State, position: Array | None) -> float:
     if each_outside > MOST_OUTSIDE * each_inside or inside[-2] < LEAST_SECOND * inside[-1]:
         return 0.0
     return min(of_gradient / total, 1.0)
+
+
+def only_of_a_gradient(state: State, position: Array | None, left: Residual) -> bool:
+    """Whether what was taken off the residual across has the shape of a uniform gradient and hardly any other, as has
+    most of what was there: a part of what a gradient does.
+
+    An error of sensors has every shape, a gradient's by as many of the directions as that holds.
+
+    Parameters
+    ----------
+    left: the residual that it was taken off.
+    """
+    before = state.residual
+    if position is None or before.across is None or gradient_share(state, position) <= MOST:
+        return False
+    assert left.across is not None
+    directions, most = _directions(state, position), len(before.noise) - 3
+    whole = float(np.sum(before.across**2) - np.sum(left.across**2))
+    inside = float(np.sum((before.across @ directions) ** 2) - np.sum((left.across @ directions) ** 2))
+    return whole - inside < HARDLY * (1.0 - directions.shape[1] / most) * whole
+
+
+def _directions(state: State, position: Array) -> Array:
+    """(3 S, K <= 5) orthonormal, what uniform gradients make of a residual across."""
+    residual = state.residual
+    forward = state.fit.forward @ nearest_frame(state.fit.forward)
+    shown = np.einsum("sij,kjl,sl->sik", forward, _symmetric(), position - position.mean(0)).reshape(-1, 5)
+    directions, size, _ = np.linalg.svd(residual.projector @ (shown / residual.noise[:, None]), full_matrices=False)
+    out: Array = directions[:, size > _RANK * size[0]] if size[0] > 0 else directions[:, :0]
+    return out
 
 
 def _symmetric() -> Array:

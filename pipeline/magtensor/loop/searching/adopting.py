@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from magtensor.error_models.settings import AsAWhole, Beginning, Forms, Frequencies, Range, profiled
+from magtensor.error_models.settings import AsAWhole, Beginning, EventTimes, Forms, Frequencies, Range, profiled
 from magtensor.error_models.terms import Terms
 from magtensor.error_models.waveform import NAME
 from magtensor.loop.evidence.assessment import estimated, explained
@@ -23,6 +23,7 @@ from magtensor.loop.searching.contribution import (
     families,
     happens_once,
     held_out,
+    moments,
     put_back,
     significance_at_once,
     slices,
@@ -39,9 +40,7 @@ _RESTS = 0.02  # relative: a setting that moves no further is settled
 def adopt(record: Record, state: State, chosen: Candidate, how: Fitting) -> State:
     """Refit with the chosen model, first on all sensors, then on those that show it."""
     after, which = on_all_sensors(record, state, chosen, how), len(state.adopted)
-    sensors = sensors_showing(after, which)
-    if sensors is None or not _spare(after, which, sensors):
-        sensors = _sufficient(after, which)
+    sensors = _needed(after, which)
     return after if sensors is None else narrowed(record, after, which, sensors, how)
 
 
@@ -80,10 +79,16 @@ def on_those_that_show(record: Record, state: State, how: Fitting, fixed: int) -
     for which in range(fixed, len(state.adopted)):
         if state.adopted[which].name == NAME or len(state.adopted) == fixed + 1:
             continue
-        sensors = sensors_showing(state, which)
-        if sensors is not None and _spare(state, which, sensors):
+        sensors = _needed(state, which)
+        if sensors is not None:
             state = narrowed(record, state, which, sensors, how)
     return state
+
+
+def _needed(state: State, which: int) -> tuple[str, ...] | None:
+    """The sensors on which alone a model does as well; None where it needs all that it has."""
+    sensors = sensors_showing(state, which)
+    return sensors if sensors is not None and _spare(state, which, sensors) else _sufficient(state, which)
 
 
 def _spare(state: State, which: int, sensors: tuple[str, ...]) -> bool:
@@ -160,9 +165,26 @@ def polished(record: Record, state: State, how: Fitting) -> State:
     """The forms of the models, what they began with and their settings on a range, sought once more now that everything
     is fitted together; a setting that is a little off leaves a residual that another model would be adopted for. Beside
     one that has moved another form may be right, and a lag show that did not, or no longer be needed."""
+    state = _at_one_moment(record, state, how)
     state = _at_rest(record, _as_they_began(record, _in_their_forms(record, state, how), how), how)
     formed = _in_their_forms(record, _with_lags_that_show(record, state, how), how)
     return state if formed is state else _at_rest(record, formed, how)
+
+
+def _at_one_moment(record: Record, state: State, how: Fitting) -> State:
+    """The models with the events at the time of another one where that is likelier: of what happened at one moment the
+    part that was found first was fitted best some samples off while the other had no name."""
+    for number, model in enumerate(state.adopted):
+        others = sorted({at for i, m in enumerate(state.adopted) if i != number for at in moments(m)})
+        for name, grid in profiled(model.component).items() if others else ():
+            if not isinstance(grid, EventTimes):
+                continue
+            here = state.adopted[number].settings
+            gain = _Beside.of(state, number)
+            best = max((float(here[name]), *others), key=lambda at: gain({**here, name: at}))
+            if best != here[name]:
+                state = _changed(record, state, number, {name: best}, how)
+    return state
 
 
 def _at_rest(record: Record, state: State, how: Fitting) -> State:

@@ -257,6 +257,12 @@ def happens_once(model: Adopted) -> bool:
     return any(isinstance(g, EventTimes) for g in profiled(model.component).values())
 
 
+def moments(model: Adopted) -> list[float]:
+    """s after the survey's start, when an event happened, in order."""
+    marks = profiled(model.component).items()
+    return sorted(float(model.settings[name]) for name, mark in marks if isinstance(mark, EventTimes))
+
+
 def a_tone(model: Adopted) -> bool:
     """Whether a model is of a tone, whose frequency is where the spectrum of what is left is strongest."""
     return any(isinstance(g, Frequencies) for g in profiled(model.component).values())

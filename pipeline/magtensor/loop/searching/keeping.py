@@ -17,6 +17,7 @@ from magtensor.loop.searching.beginnings import at_its_limit, began_with_a_vecto
 from magtensor.loop.searching.contribution import (
     agrees,
     happens_once,
+    moments,
     of_all_alike,
     share_of_differences,
     share_of_the_field,
@@ -121,7 +122,7 @@ def why_not(record: Record, before: Trial, after: Trial, chosen: Candidate, how:
         if channel := event_of_a_curve(seen, chosen.terms, theta, chosen.assessment.colours):
             return f"a curve of {channel} explains most of it: what is adopted may miss its law"
         terms = chosen.terms.only(i for i, s in enumerate(chosen.terms.sensors) if s in acts_on)
-        if channel := channel_instead(seen, terms, chosen.assessment.colours):
+        if channel := channel_instead(seen, terms, chosen.assessment.colours, min(moments(model))):
             return f"C of {', '.join(acts_on)} follows {channel}, which explains more than something that happens once"
         if better_left_out(record, before.state, after.state, which, how):
             return "fitted, its samples are far from its law: the others are fitted better without them"

@@ -18,6 +18,7 @@ from magtensor.error_models.terms import Terms
 from magtensor.loop.evidence.assessment import NEARLY_ALL, Assessment
 from magtensor.loop.fitting.log_noise import channels_of
 from magtensor.loop.fitting.model import Adopted, State
+from magtensor.loop.searching.contribution import moments
 from magtensor.loop.searching.gates import Candidate, explained_by, seen_between
 
 MOST = 0.5  # of what a candidate explains
@@ -73,14 +74,8 @@ def drivers(model: Adopted, x: Excitation) -> set[str]:
 def _same_moment(model: Adopted, other: Adopted, x: Excitation) -> bool:
     """Whether two events happened between the same samples: a jump of C is one of its scale factors and one of its
     angles, and what one leaves there the other explains exactly."""
-    mine, theirs = (np.searchsorted(x.elapsed, _moments(m)) for m in (model, other))
+    mine, theirs = (np.searchsorted(x.elapsed, moments(m)) for m in (model, other))
     return mine.size > 0 and mine.shape == theirs.shape and bool(np.all(mine == theirs))
-
-
-def _moments(model: Adopted) -> list[float]:
-    """s, when it happened."""
-    marks = profiled(model.component).items()
-    return sorted(float(model.settings[name]) for name, mark in marks if isinstance(mark, EventTimes))
 
 
 def _of_time(grid: Any) -> bool:

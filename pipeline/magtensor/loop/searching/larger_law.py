@@ -1,4 +1,4 @@
-"""Candidates that are a small part of a law of the attitude which has no name.
+"""Candidates that are a small part of a law of the attitude which has no name, or of a gradient that cannot be told.
 
 Every law of the attitude resembles any other one a little: of a kink in the transfer curve of each axis a polynomial
 takes the most, a gradient of the site some of the rest, an error of the positions a little of that. What each of them
@@ -15,6 +15,8 @@ from magtensor.error_models.terms import Terms, joined
 from magtensor.loop.evidence.assessment import estimated
 from magtensor.loop.evidence.residual import Residual, taken_off
 from magtensor.loop.fitting.model import Adopted, State
+from magtensor.loop.remainder.gradient_shape import MODEL as GRADIENT
+from magtensor.loop.remainder.gradient_shape import only_of_a_gradient
 from magtensor.loop.remainder.predictable import attitude_square
 from magtensor.loop.searching.contribution import a_tone
 from magtensor.loop.searching.gates import Candidate, seen_between
@@ -40,6 +42,20 @@ def part_of_a_larger_law(candidate: Candidate, state: State) -> str:
         return ""
     ratio = np.sqrt(max(explained, 0.0) / stays)
     return f"it follows the attitude, and so does what it leaves, of which it is {ratio:.0%}"
+
+
+def part_of_a_gradient(candidate: Candidate, state: State) -> str:
+    """Why a candidate is not adopted that explains only what has the shape of a uniform gradient, of which far more is
+    left and which no attitude lets anyone follow; "" where it is not so."""
+    before, terms = candidate.before or state, candidate.terms
+    x = before.excitation
+    if before.residual.across is None or terms.delay is not None or x.attitude is not None:
+        return ""
+    together = terms if before.terms is None else joined([before.terms, terms])
+    estimate = estimated(before.residual, together, candidate.assessment.colours)
+    if not only_of_a_gradient(before, x.position, taken_off(before.residual, together, estimate.theta)):
+        return ""
+    return f"what it explains has the shape of a uniform gradient of the field: {GRADIENT} lacks the attitude"
 
 
 def _differs_between_sensors(residual: Residual, terms: Terms, known: Array) -> bool:

@@ -21,7 +21,7 @@ from magtensor.loop.searching.exchange import looked_at_again, simpler
 from magtensor.loop.searching.found import Step
 from magtensor.loop.searching.gates import Candidate
 from magtensor.loop.searching.keeping import ONE_OF_A_KIND, UNEARNED, Fitted, fitted, fitted_everywhere, why_not
-from magtensor.loop.searching.larger_law import part_of_a_larger_law
+from magtensor.loop.searching.larger_law import part_of_a_gradient, part_of_a_larger_law
 from magtensor.loop.searching.latent import NAME, Sought, Source, renewed, sought, tried_source
 from magtensor.loop.searching.likeness import followed_by_a_curve, part_of_the_source
 from magtensor.loop.searching.on_more_sensors import on_more_sensors
@@ -253,7 +253,7 @@ class Rounds:
             return f"{name}, which lasts, predicts as much"
         if name := rate_instead(chosen, state, self.models):
             return f"{name}, for which the field turns too fast between samples, explains more"
-        return part_of_a_larger_law(chosen, state)
+        return part_of_a_larger_law(chosen, state) or part_of_a_gradient(chosen, state)
 
     def kept_with_another(
         self,
