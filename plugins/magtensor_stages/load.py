@@ -74,6 +74,7 @@ def load(
         found = _only_window(found, window_s, where)
     if len(found.time) < 2:
         raise NotEnoughData("a single sample is no survey", where=where)
+    found = _without_fill_values(found, notes)
     found, impossible = _without_impossible(found)
     _refuse_faults(found, magnitude, copied_axes, where)
     _judge_position(found, magnitude, where, notes)
@@ -261,6 +262,21 @@ def _refuse_magnitude(survey: Survey, where: str) -> None:
                     where=f"{where}: sensor {name}",
                     hint=f"are the scale, the offset and the reference those of this survey? {accept}",
                 )
+
+
+def _without_fill_values(survey: Survey, notes: list[str]) -> Survey:
+    """The survey with numbers that stand for missing values in logged channels, undeclared, made missing."""
+    from magtensor.loop.fitting.record import channels_of
+
+    filled: dict[str, Any] = {}
+    for name, values in channels_of(survey)[0].items():
+        found = checks.fill_value(values)
+        if found is not None:
+            count = int((values == found).sum())
+            notes.append(f"{name}: {count} values of {found:.6g}, far from all others, are taken for missing ones")
+            variable = survey[name]
+            filled[name] = (tuple(variable.dims), np.where(values == found, np.nan, values), variable.attrs)
+    return survey.merged(filled) if filled else survey
 
 
 def _without_impossible(survey: Survey) -> tuple[Survey, dict[str, NDArray[np.bool_]]]:

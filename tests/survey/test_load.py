@@ -92,6 +92,39 @@ def test_missing_reference_values_are_left_out(load_variables: Load, variables: 
         load_variables(changed(variables, "reference/total_field", set_to(slice(None), np.nan)))
 
 
+WARM = 18.0 + 4.0 * np.sin(np.arange(400) / 60.0)
+
+
+@pytest.mark.parametrize(
+    ("values", "found"),
+    [
+        (np.where(np.arange(400) % 90 == 7, -999.0, WARM), -999.0),
+        (np.where(np.arange(400) > 300, 9999.9, WARM).astype(np.float32), 9999.9),
+        (np.where(np.arange(400) == 3, -9999.0, np.where(np.arange(400) % 3, np.nan, WARM)), -9999.0),
+        (WARM, None),
+        (np.where(np.arange(400) % 90 == 7, -321.0, WARM), None),  # a spike, whatever it is
+        (np.arange(600.0, 1000.0), None),  # a counter gets there
+        (np.where(np.arange(400) % 2, 999.0, WARM), None),  # as often as not: a switch
+        (np.where(np.arange(400) % 5, 0.0, 999.0), None),  # two levels
+        (np.full(400, 999.0), None),
+        (np.full(400, np.nan), None),
+    ],
+)
+def test_numbers_that_stand_for_missing_values_of_a_channel(
+    load_variables: Load, variables: Variables, values: Any, found: float | None
+) -> None:
+    survey = load_variables({**variables, "temperature": (["time"], values, {"units": "degC"})})
+    kept = survey.values("temperature")
+    if found is None:
+        np.testing.assert_array_equal(kept, values)
+        assert "notes" not in survey.attributes
+    else:
+        lost = np.isclose(values, found)
+        np.testing.assert_array_equal(kept, np.where(lost, np.nan, values))
+        assert survey["temperature"].attrs["units"] == "degC"
+        assert f"temperature: {lost.sum()} values of {found:.6g}, far from all" in survey.attributes["notes"][0]
+
+
 def test_missing_and_infinite_values_are_flagged(load_variables: Load, variables: Variables) -> None:
     damaged = changed(variables, "b_raw", set_to((slice(20, 30), 1, 2), np.nan))
     damaged = changed(damaged, "b_raw", set_to((50, 3, 0), np.inf))

@@ -5,6 +5,8 @@ The functions find; the stage `load` decides what to refuse and what to flag. Ro
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 
 from magtensor.survey.recorded_numbers import Bools, Floats, believable_run, resolution, runs, span
@@ -14,6 +16,8 @@ from magtensor.survey.recorded_numbers import Bools, Floats, believable_run, res
 EARTH_FIELD_NT = (22_000.0, 67_000.0)
 MARGIN = 2.0
 LARGEST_ARRAY_M = 100.0
+FAR_FILL = 5.0
+NINES = re.compile(r"-?9{2,}\.?9+")  # as six digits show it
 IMPOSSIBLE = 1e3  # times a sensor's median magnitude: no range reaches so far beyond what it measures
 # What a number that was labelled nT may have been, with the factor that makes nT of it.
 RIVALS = (
@@ -35,6 +39,26 @@ def impossible(field: Floats) -> Bools:
         if len(whole):
             found[:, s] = size[:, s] > IMPOSSIBLE * float(np.median(whole.max(axis=1)))
     return found
+
+
+def fill_value(values: Floats) -> float | None:
+    """The number that stands for a missing value in a logged channel though nothing declares it; else None.
+
+    Three nines or more, with either sign, that no other value of the channel comes near: farther from all of them than
+    `FAR_FILL` times what they span. In less than half of the samples.
+
+    Args:
+        values: a channel, NaN allowed.
+    """
+    finite = values[np.isfinite(values)]
+    for found in (float(finite.min()), float(finite.max())) if len(finite) else ():
+        others = finite[finite != found]
+        if len(others) <= len(finite) / 2 or not NINES.fullmatch(f"{found:.6g}"):
+            continue
+        spread, away = float(np.ptp(others)), float(np.min(np.abs(others - found)))
+        if 0 < FAR_FILL * spread < away:
+            return found
+    return None
 
 
 def dead_axes(field: Floats) -> list[int]:
