@@ -45,6 +45,19 @@ def test_steps_of_resolution_are_smoothed_and_a_dense_log_is_left() -> None:
     np.testing.assert_array_equal(unheld(TIME, np.zeros(3000)), 0.0)
 
 
+@pytest.mark.parametrize("step", [0.1, 0.25, 0.5])
+@pytest.mark.parametrize("noise", [0.0, 0.02])
+def test_a_rounded_log_changes_half_way_between_two_steps(step: float, noise: float) -> None:
+    """Rounding leaves 0.29 of a step, and joining the new values from change to change would be half a step ahead."""
+    rng = np.random.default_rng(7)
+    rounded = np.round((course(TIME) + noise * rng.standard_normal(len(TIME))) / step) * step
+    error = unheld(TIME, rounded) - course(TIME)
+    assert np.std(error) < 0.25 * step + noise
+    rising = np.gradient(course(TIME), TIME)
+    ahead = np.sum(error * rising) / np.sum(rising**2)  # s
+    assert abs(ahead) * np.abs(rising).max() < 0.1 * step + 0.2 * noise
+
+
 def test_what_goes_on_between_regular_readings_is_not_rounded_off() -> None:
     angular = 2.0 * np.pi / 300.0  # read ten times a period
     true = np.sin(angular * TIME)
