@@ -145,6 +145,7 @@ def test_what_another_width_of_an_adopted_law_explains_is_no_other_effect(
     monkeypatch.setattr(rounds, "hindered_by_another", lambda *_: None)
     monkeypatch.setattr(rounds, "as_predictive", lambda *_: set())
     monkeypatch.setattr(rounds, "part_of_a_larger_law", lambda *_: "")
+    monkeypatch.setattr(rounds, "part_of_a_gradient", lambda *_: "")
     monkeypatch.setattr(rounds, "part_of_a_drift", lambda *_: "")
     monkeypatch.setattr(rounds, "beside_time", lambda *_: BesideTime(True))
     monkeypatch.setattr(rounds, "part_of", lambda *_: False)
@@ -179,6 +180,7 @@ def test_of_one_name_the_curve_of_another_channel_is_still_tried(monkeypatch: py
         "simplest": unchanged,
         "nearest": unchanged,
         "part_of_a_larger_law": lambda *_: "",
+        "part_of_a_gradient": lambda *_: "",
         "part_of_a_drift": lambda *_: "",
         "rate_instead": lambda *_: "",
         "hindered_by_another": lambda *_: None,

@@ -52,7 +52,7 @@ def test_a_step_beside_another_model_is_tested_as_a_single_series(tmp_path: Path
     assert noise.p_value(step) == pytest.approx(noise.p_value(alone))
 
 
-@pytest.mark.parametrize("angles", [3, 6])
+@pytest.mark.parametrize("angles", [pytest.param(3, marks=pytest.mark.long), 6])
 def test_what_changed_at_the_moment_of_a_jump_is_more_of_it(tmp_path: Path, angles: int) -> None:
     """A piece of iron has moved: the scale factor that changed stands for most of the jump of C, and a hundredth of
     that, which is an angle, is neither lost nor blamed on a temperature that rises."""

@@ -32,7 +32,7 @@ def twice_on_z(b: Array) -> Array:
 @pytest.mark.parametrize(
     ("wrong", "first", "count", "effect"),
     [
-        (x_negated, 1440, 96, True),
+        pytest.param(x_negated, 1440, 96, True, marks=pytest.mark.long),
         (twice_on_z, 1680, 240, False),
         pytest.param(x_negated, 1440, 96, False, marks=pytest.mark.long),
         pytest.param(x_negated, 720, 440, False, marks=pytest.mark.long),
