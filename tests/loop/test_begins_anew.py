@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ STEP = {"type": "offset_step", "time_s": [250.0], "nT": [[0.0] * 3, [0.6, -0.5, 
 SLIP = {"type": "lag_step", "time_s": 250.0, "lag_s": [[0.0] * 3, [0.02] * 3, [0.0] * 3, [0.0] * 3]}
 WARMING = {"type": "warm_up", "tau_s": 120.0, "nT": [[0.0] * 3, [2.0, -1.5, 1.0], [0.0] * 3, [0.0] * 3]}
 RETUNED = {"type": "scale_step", "time_s": [250.0], "ppm": [[0.0] * 3, [20.0, -15.0, 25.0], [0.0] * 3, [0.0] * 3]}
+Found = Callable[[dict[str, Any]], tuple[ClosedLoop, Path]]
 LATER = "2026-06-12T09:00:00Z"
 
 
@@ -28,15 +30,25 @@ def of_a_day(seed: int, *effects: dict[str, Any], start: str | None = None) -> d
     return made | ({} if start is None else {"start": start})
 
 
-def found(folder: Path, effect: dict[str, Any]) -> ClosedLoop:
-    done = magtensor.close_loop(survey_file(folder, of_a_day(5, effect)), search=[str(effect["type"])])
-    assert [a["error_model"] for a in done.verdict["adopted"]] == [effect["type"]]
-    return done
+@pytest.fixture(scope="module")
+def found(tmp_path_factory: pytest.TempPathFactory) -> Found:
+    """The first day's survey with an effect, the loop closed; each once."""
+    folder, known = tmp_path_factory.mktemp("first"), dict[str, tuple[ClosedLoop, Path]]()
+
+    def of(effect: dict[str, Any]) -> tuple[ClosedLoop, Path]:
+        name = str(effect["type"])
+        if name not in known:
+            path = survey_file(folder, of_a_day(5, effect), f"{name}.h5")
+            known[name] = magtensor.close_loop(path, search=[name]), path
+        assert [a["error_model"] for a in known[name][0].verdict["adopted"]] == [name]
+        return known[name]
+
+    return of
 
 
 @pytest.mark.parametrize("effect", [DRIFT, FADING, STEP], ids=lambda e: str(e["type"]))
-def test_another_day_begins_anew(tmp_path: Path, effect: dict[str, Any]) -> None:
-    done = found(tmp_path, effect)
+def test_another_day_begins_anew(tmp_path: Path, found: Found, effect: dict[str, Any]) -> None:
+    done, _ = found(effect)
     same, later = (survey_file(tmp_path, of_a_day(6, effect, start=s), f"{s is None}.h5") for s in (None, LATER))
     there = done.calibration.apply(later)
     assert there["calibrated/b"].attrs["begins_anew"] == effect["type"]
@@ -70,11 +82,11 @@ def test_a_drift_that_goes_on_does_not_begin_anew(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("effect", [DRIFT, STEP], ids=lambda e: str(e["type"]))
 @pytest.mark.parametrize("seed", [6, 7])
-def test_what_stays_does_not_begin_anew(tmp_path: Path, effect: dict[str, Any], seed: int) -> None:
+def test_what_stays_does_not_begin_anew(tmp_path: Path, found: Found, effect: dict[str, Any], seed: int) -> None:
     """On the other day the offsets are what they were at the end of the first, and a little besides."""
-    done = found(tmp_path, effect)
+    done, first = found(effect)
     bare = survey_file(tmp_path, of_a_day(seed, start=LATER), "bare.h5")
-    with h5py.File(tmp_path / "survey.h5") as file:
+    with h5py.File(first) as file:
         last = file[f"truth/effect_00_{effect['type']}"][-1]
     with h5py.File(bare, "r+") as file:
         file["b_raw"][...] += last + 0.3 * np.random.default_rng(seed).standard_normal(last.shape)
@@ -83,9 +95,11 @@ def test_what_stays_does_not_begin_anew(tmp_path: Path, effect: dict[str, Any], 
 
 @pytest.mark.parametrize("effect", [STEP, RETUNED], ids=lambda e: str(e["type"]))
 @pytest.mark.parametrize(("at", "when"), [([0.1], "happened before"), ([], "not yet"), ([250.0], "")])
-def test_outputs_come_before_the_dates(tmp_path: Path, effect: dict[str, Any], at: list[float], when: str) -> None:
+def test_outputs_come_before_the_dates(
+    tmp_path: Path, found: Found, effect: dict[str, Any], at: list[float], when: str
+) -> None:
     """A second survey on the clock of the first: its jump was at that time, or the clock was set back to it."""
-    done = found(tmp_path, effect)
+    done, _ = found(effect)
     there = survey_file(tmp_path, of_a_day(6, *([effect | {"time_s": at}] if at else [])), "there.h5")
     b = done.calibration.apply(there)["calibrated/b"]
     assert b.attrs.get("not_as_dated", "") == (f"{effect['type']} ({when})" if when else "")
@@ -95,9 +109,9 @@ def test_outputs_come_before_the_dates(tmp_path: Path, effect: dict[str, Any], a
 
 
 @pytest.mark.parametrize("again", [True, False])
-def test_a_slip_goes_on_where_the_outputs_show_it(tmp_path: Path, again: bool) -> None:
+def test_a_slip_goes_on_where_the_outputs_show_it(tmp_path: Path, found: Found, again: bool) -> None:
     """Recorders begin in step on another day, but not all of them."""
-    done = found(tmp_path, SLIP)
+    done, _ = found(SLIP)
     there = survey_file(tmp_path, of_a_day(6, *([SLIP | {"time_s": 0.0}] if again else []), start=LATER), "there.h5")
     b = done.calibration.apply(there)["calibrated/b"]
     assert b.attrs.get("not_as_dated", "") == ("lag_step (happened before)" if again else "")
@@ -106,8 +120,8 @@ def test_a_slip_goes_on_where_the_outputs_show_it(tmp_path: Path, again: bool) -
 
 
 @pytest.mark.parametrize("switched_on_s", [-1e5, -110.0, 0.0])
-def test_what_was_switched_on_before_is_warm(tmp_path: Path, switched_on_s: float) -> None:
-    done = found(tmp_path, WARMING)
+def test_what_was_switched_on_before_is_warm(tmp_path: Path, found: Found, switched_on_s: float) -> None:
+    done, _ = found(WARMING)
     before = WARMING | {"switched_on_s": switched_on_s}
     there = survey_file(tmp_path, of_a_day(6, before, start=LATER), "there.h5")
     b = done.calibration.apply(there)["calibrated/b"]

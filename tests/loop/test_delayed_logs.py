@@ -84,9 +84,8 @@ def moved(path: Path, samples: int) -> None:
         logged[:] = logged[:][at]
 
 
-@pytest.mark.parametrize(
-    ("samples", "power", "lag_s"), [(LATE, 2, -11.5), pytest.param(-LATE, 1, 11.5, marks=pytest.mark.long)]
-)
+@pytest.mark.long
+@pytest.mark.parametrize(("samples", "power", "lag_s"), [(LATE, 2, -11.5), (-LATE, 1, 11.5)])
 def test_a_gusty_wind_logged_at_another_time_is_found(samples: int, power: int, lag_s: float, tmp_path: Path) -> None:
     effect = {"type": "channel_response", "channel": "wind", "power": power, "rms_nT": 1.0}
     wind = {"type": "smooth", "mean": 0.0, "rms": 2.0, "time_s": 2.0, "units": "m/s", "log_noise": 0.002}

@@ -105,7 +105,8 @@ def test_one_part_that_is_made_worse_contradicts_the_others() -> None:
     assert Gain(before, before - gained, values).contradicted
 
 
-@pytest.mark.parametrize("at", [600.0, pytest.param(660.0, marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("at", [600.0, 660.0])
 def test_a_vehicle_is_found_wherever_it_passes(at: float, tmp_path: Path) -> None:
     told = verdict_of(tmp_path, scenario(31, PASSING | {"time_s": at, "rms_nT": 0.3}), models=MODELS)
     assert adopted_names(told) == {"passing_source"}

@@ -29,7 +29,8 @@ def remounted(seed: int) -> dict[str, Any]:
     return scenario(seed, turned, moved)
 
 
-@pytest.mark.parametrize("seed", [3, pytest.param(4, marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("seed", [3, 4])
 def test_both_steps_are_found(seed: int, tmp_path: Path) -> None:
     found = verdict_of(tmp_path, remounted(seed), models=[*BOTH, "temperature_offset", "temperature_alignment"])
     assert adopted_names(found) == set(BOTH)

@@ -129,9 +129,9 @@ def noise_words(state: State, record: Record) -> list[str]:
         else:
             sensors, axis = state.excitation.sensors, np.sqrt(np.mean(residual.noise.reshape(-1, 3) ** 2, axis=1))
             each = zip(sensors, np.sqrt(np.maximum(_beyond_white(residual), 0.0)), axis, strict=True)
-            slower = [f"{slow:.2g} nT rms of {name}" for name, slow, least in each if slow > least]
+            slower = [f"{slow:.2g} nT rms on {name}" for name, slow, least in each if slow > least]
             if 0 < len(slower) < len(sensors):
-                words.append(f"as vectors {' and '.join(slower)} are slow noise")
+                words.append(f"slow noise, as a vector: {', '.join(slower)}")
     if (slow := slow_along(state)) > white:
         station = of_the_station(state, record)
         makes = "may make all" if station > slow else f"makes {station:.2g} nT"  # known from how its readings scatter
