@@ -33,7 +33,13 @@ def gradient(rms_nT: float) -> dict[str, Any]:
 
 
 @pytest.mark.long
-def test_a_gradient_without_attitude_is_no_nonlinearity(tmp_path: Path) -> None:
+@pytest.mark.parametrize("seen_at_once", [True, False])
+def test_a_gradient_without_attitude_is_no_nonlinearity(
+    seen_at_once: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By the shape of what it explains; and without that rule by what it leaves, once nothing else is adopted."""
+    if not seen_at_once:
+        monkeypatch.setattr(rounds, "part_of_a_gradient", lambda *_: "")
     told = verdict_of(tmp_path, scenario(21, gradient(0.6), motion=SHORT), models=MODELS)
     assert adopted_names(told) == set()
     assert {n["error_model"]: n["missing"] for n in told["not_tested"]} == {"site_gradient": ["attitude"]}
@@ -41,8 +47,11 @@ def test_a_gradient_without_attitude_is_no_nonlinearity(tmp_path: Path) -> None:
     assert told["unexplained"]["looks_like"][0] == "site_gradient"
     assert "cannot be tested without attitude" in told["unexplained"]["description"]
     why = {r["error_model"]: r["why"] for r in told["rejected"]}["nonlinearity_quadratic"]
-    assert "follows the attitude" in why and "nT that stay" in why
-    assert told["steps"][0]["adopted"] == "nonlinearity_quadratic" and told["steps"][-1]["refused"]  # what it is about
+    if seen_at_once:
+        assert "has the shape of a uniform gradient" in why
+    else:
+        assert "follows the attitude" in why and "nT that stay" in why
+        assert told["steps"][0]["adopted"] == "nonlinearity_quadratic" and told["steps"][-1]["refused"]
 
 
 @pytest.mark.long
