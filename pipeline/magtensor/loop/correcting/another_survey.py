@@ -205,7 +205,7 @@ def as_dated_here(
     """An effect that is known to go with the time since the survey of the calibration began, as this survey shows it.
 
     What the outputs say comes before the dates: a drift of what is switched on with the survey and a jump at the same
-    time of each begin anew, a jump was mended or is yet to come, or the clock was never set. That has to be nearer to
+    time of each begin anew, a jump was mended or has not happened yet, or the clock was never set. That has to be nearer to
     the outputs, and its course to be seen in them whatever the offsets are, which differ from survey to survey. A
     steady drift that goes on has the course of one that begins anew too, and is elsewhere.
     """
@@ -225,7 +225,7 @@ def as_dated_here(
 
 
 def _otherwise(model: Adopted, record: Record) -> list[Adopted]:
-    """An effect that begins anew with a survey, one that was over before it, and one that is yet to come.
+    """An effect that begins anew with a survey, one that happened before it, and one that has not yet.
 
     A slip of a recorder, which ends with the survey as a rule, goes on where it was before.
     """

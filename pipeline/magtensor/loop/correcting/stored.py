@@ -98,8 +98,8 @@ def on_its_clock(
 ) -> list[Adopted]:
     """Effects of a calibration as they are on another survey: what happened at a time has happened since then.
 
-    A jump stays, and a drift holds its last value, unless the survey's own outputs show that it begins anew, was over
-    before or is yet to come. Warming up begins with every survey, and what a lagged response began with is another
+    A jump stays, and a drift holds its last value, unless the survey's own outputs show that it begins anew, happened
+    before or has not yet. Warming up begins with every survey, and what a lagged response began with is another
     survey's own.
     """
     begun = calibration["calibration/effects"].attrs.get("start") if adopted else None
@@ -127,9 +127,9 @@ def begun_anew(adopted: Sequence[Adopted], calibration: Survey) -> str:
 def not_as_dated(adopted: Sequence[Adopted], survey: Survey) -> str:
     """Which effects that go with time had happened before a survey, or not yet in it, where the dates say otherwise;
     "" where none is."""
-    late = {a.name: (a.start or 0.0) - float(survey.time[0]) for a in adopted if a.start is not None}
-    words = {n: "happened before" if s < 0 else "not yet" for n, s in late.items() if abs(s) >= LONG}
-    return ", ".join(f"{name} ({when})" for name, when in words.items())
+    late = [(a.name, a.start - float(survey.time[0])) for a in adopted if a.start is not None]
+    words = [f"{name} ({'happened before' if s < 0 else 'not yet'})" for name, s in late if abs(s) >= LONG]
+    return ", ".join(dict.fromkeys(words))
 
 
 def in_equilibrium(adopted: Sequence[Adopted], survey: Survey) -> str:

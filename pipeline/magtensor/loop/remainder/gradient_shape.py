@@ -13,6 +13,7 @@ from magtensor.calibration.joint import nearest_frame
 from magtensor.calibration.types import Array
 from magtensor.loop.evidence.residual import Residual
 from magtensor.loop.fitting.model import State
+from magtensor.loop.fitting.separation import SEPARATION
 
 MODEL = "site_gradient"
 MOST_OUTSIDE = 0.1  # of the variance of each of its directions: what any other direction holds at most
@@ -20,7 +21,6 @@ LEAST_SECOND = 0.05  # of the strongest direction: a single waveform of any sour
 CLEARLY = 5.0  # times the variance of any other direction, where the noise is not known
 BEYOND_CHANCE = 5.0  # standard deviations of the white noise's own variance
 MOST = 0.5  # of what is left above the white noise
-HARDLY = 0.5  # of what an error of sensors has of other shapes
 _RANK = 1e-6
 
 
@@ -60,24 +60,24 @@ def gradient_share(state: State, position: Array | None) -> float:
     return min(of_gradient / total, 1.0)
 
 
-def only_of_a_gradient(state: State, position: Array | None, left: Residual) -> bool:
-    """Whether what was taken off the residual across has the shape of a uniform gradient and hardly any other, as has
-    most of what was there: a part of what a gradient does.
+def only_of_a_gradient(state: State, position: Array | None, left: Residual, coefficients: int) -> bool:
+    """Whether what was taken off the residual across has the shape of a uniform gradient, as has most of what was
+    there, and leaves no less of any other shape than chance would: a part of what a gradient does.
 
-    An error of sensors has every shape, a gradient's by as many of the directions as that holds.
+    An error of sensors has other shapes too, and what stands for a gradient brings some in.
 
     Parameters
     ----------
-    left: the residual that it was taken off.
+    left: the residual that it was taken off; coefficients: with so many.
     """
     before = state.residual
     if position is None or before.across is None or gradient_share(state, position) <= MOST:
         return False
     assert left.across is not None
-    directions, most = _directions(state, position), len(before.noise) - 3
+    directions = _directions(state, position)
     whole = float(np.sum(before.across**2) - np.sum(left.across**2))
     inside = float(np.sum((before.across @ directions) ** 2) - np.sum((left.across @ directions) ** 2))
-    return whole - inside < HARDLY * (1.0 - directions.shape[1] / most) * whole
+    return whole - inside < SEPARATION + coefficients
 
 
 def _directions(state: State, position: Array) -> Array:

@@ -53,7 +53,10 @@ def part_of_a_gradient(candidate: Candidate, state: State) -> str:
         return ""
     together = terms if before.terms is None else joined([before.terms, terms])
     estimate = estimated(before.residual, together, candidate.assessment.colours)
-    if not only_of_a_gradient(before, x.position, taken_off(before.residual, together, estimate.theta)):
+    if not seen_between(before.residual, terms, estimate.theta[-terms.count :]):
+        return ""
+    left = taken_off(before.residual, together, estimate.theta)
+    if not only_of_a_gradient(before, x.position, left, terms.count):
         return ""
     return f"what it explains has the shape of a uniform gradient of the field: {GRADIENT} lacks the attitude"
 
