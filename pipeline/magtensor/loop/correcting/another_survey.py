@@ -205,9 +205,9 @@ def as_dated_here(
     """An effect that is known to go with the time since the survey of the calibration began, as this survey shows it.
 
     What the outputs say comes before the dates: a drift of what is switched on with the survey and a jump at the same
-    time of each begin anew, a jump was mended or has not happened yet, or the clock was never set. That has to be nearer to
-    the outputs, and its course to be seen in them whatever the offsets are, which differ from survey to survey. A
-    steady drift that goes on has the course of one that begins anew too, and is elsewhere.
+    time of each begin anew, a jump was mended or has not happened yet, or the clock was never set. That has to be
+    nearer to the outputs, and its course to be seen in them whatever the offsets are, which differ from survey to
+    survey. A steady drift that goes on has the course of one that begins anew too, and is elsewhere.
     """
     model, theta = own[number]
     if model.start is None or not shows_a_state(record.raw, record.position is not None):
