@@ -16,7 +16,7 @@ from magtensor.survey.recorded_numbers import Bools, Floats, believable_run, res
 EARTH_FIELD_NT = (22_000.0, 67_000.0)
 MARGIN = 2.0
 LARGEST_ARRAY_M = 100.0
-FAR_FILL = 5.0
+FAR_FILL = 5.0  # times what all other values span
 NINES = re.compile(r"-?9{2,}\.?9+")  # as six digits show it
 IMPOSSIBLE = 1e3  # times a sensor's median magnitude: no range reaches so far beyond what it measures
 # What a number that was labelled nT may have been, with the factor that makes nT of it.
