@@ -102,6 +102,7 @@ def apply(
         "otherwise than the dates say, as this survey's own outputs show": "not_as_dated",
         "taken to begin in equilibrium, which four sensors of known positions would show": "in_equilibrium",
         "NOT taken off, for the lengths of this survey's vectors refute it": "not_on_this_survey",
+        "taken off, though |b| would be nearer to this survey's total field without": "contradicted",
     }
     told_of = (f"{what}: {attributes[name]}" for what, name in each.items() if name in attributes)
     notes = (*summary(found.flags), *told_of)
@@ -182,6 +183,7 @@ def apply_and_refine(
         begun_anew,
         bridged,
         cleaned,
+        contradicted_here,
         extrapolated,
         in_equilibrium,
         not_as_dated,
@@ -239,7 +241,10 @@ def apply_and_refine(
             survey = as_read
             names = ", ".join(a.name for a in adopted if a.component.effect == "reference")
             given = corrected(fitted, survey, **words, total_field_as_read=names)
-        survey = survey.merged(_named(given, calibration, dated, apart))
+        doubted = ""
+        if rows is None and judge:
+            doubted = contradicted_here(before, survey, as_fitted(calibration, fitted), adopted, theta, origins)
+        survey = survey.merged(_named(given, calibration, dated, apart, doubted))
         if refine_rotation:
             survey, turned = with_refined_rotation(survey, calibration, fitted)
             if turned is not None:  # as it is kept, it holds the scatter beside the covariance
@@ -268,13 +273,18 @@ def apply_and_refine(
     return survey, turned
 
 
-def _named(given: dict[str, Variable], calibration: Survey, dated: str, scatter: float) -> dict[str, Variable]:
+def _named(
+    given: dict[str, Variable], calibration: Survey, dated: str, scatter: float, doubted: str
+) -> dict[str, Variable]:
     """The variables of a calibrated survey, with the words that say whose offsets were taken off, by how many nT they
-    scatter about this survey's, and the date that the calibration was brought to."""
+    scatter about this survey's, the date that the calibration was brought to, and which effects the survey's own total
+    field contradicts."""
     from magtensor.offsets_apart import for_another
 
     whose = for_another(str(calibration["calibration/matrix"].attrs.get("offset_of", "")), scatter)
-    words = {"offset_of": whose, "calibration_date": dated, "offset_scatter_nT": scatter}
+    words = {
+        "offset_of": whose, "calibration_date": dated, "offset_scatter_nT": scatter, "contradicted": doubted,
+    }  # fmt: skip
     dims, values, attributes = given["calibrated/b"]
     return given | {"calibrated/b": (dims, values, dict(attributes) | {k: v for k, v in words.items() if v})}
 
@@ -288,7 +298,8 @@ def _told(attributes: Mapping[str, Any]) -> str:
 def verification(calibrated: Survey, path: Path | Held, planned: Plan) -> dict[str, Any]:
     """The error blocks of another survey: with the declared model alone, and with all that was adopted.
 
-    `total_field_as_read` names errors of the base station that were left in (`_better_as_read`).
+    `total_field_as_read` names errors of the base station that were left in (`_better_as_read`), `contradicted` effects
+    without which |b| would be nearer to the survey's total field.
     """
     corrected = apply_to(calibrated, path, planned, uniform=True)
     after = survey_block(corrected)
@@ -298,7 +309,8 @@ def verification(calibrated: Survey, path: Path | Held, planned: Plan) -> dict[s
         before = survey_block(alone.merged({"good": corrected["good"]}))  # the same samples
     found: dict[str, Any] = {"before": before, "after": after}
     attributes = corrected["calibrated/b"].attrs
-    return found | {name: attributes[name] for name in ("not_taken_off", "total_field_as_read") if name in attributes}
+    told = ("not_taken_off", "total_field_as_read", "contradicted")
+    return found | {name: attributes[name] for name in told if name in attributes}
 
 
 def _better_as_read(

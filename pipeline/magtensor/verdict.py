@@ -130,6 +130,7 @@ def _disagreement(outcome: dict[str, Any]) -> str:
         return ""
     if as_read := verify.get("total_field_as_read"):
         return f"; the verification survey's total field has no {as_read}: it is judged as it was read"
+    contradicted = str(verify.get("contradicted", ""))
     key = "total_field_rms_nT"
     before, after, here = ((b or {}).get(key) or {} for b in (verify["before"], verify["after"], held_out["after"]))
     known = [v is not None for v in (before.get("all"), after.get("all"), here.get("all"))]
@@ -142,7 +143,10 @@ def _disagreement(outcome: dict[str, Any]) -> str:
             "in it and in its errors"
         )
     if worse:
-        return "; what was added makes the verification survey worse: it does not carry over"
+        what = f", {contradicted} above all" if contradicted else ""
+        return f"; what was added makes the verification survey worse{what}: it does not carry over"
+    if contradicted:
+        return f"; |b| would be nearer to the verification survey's total field without {contradicted}"
     if apart:
         return (
             "; the verification survey disagrees with the calibration: something changed between the two, or the first "

@@ -64,6 +64,20 @@ def spikes(samples: list[int]) -> Change:
     return change
 
 
+def test_an_effect_that_a_survey_does_not_have_is_told(
+    tmp_path: Path, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A cable laid elsewhere since: the heater's current is logged, and makes no field any more."""
+    found = magtensor.close_loop(folder / "heated.h5", search=["current_field"], verify=folder / "other.h5")
+    assert "the verification survey worse, current_field above all: it does not carry over" in found.sentence
+    found.calibration.save(tmp_path / "c.nc")
+    for name, told in (("hot.h5", False), ("other.h5", True)):
+        assert status_of(["apply", str(tmp_path / "c.nc"), str(folder / name), "--output", str(tmp_path / name)]) == 0
+        said = capsys.readouterr().out
+        words = "taken off, though |b| would be nearer to this survey's total field without: current_field\n"
+        assert (words in said) is told
+
+
 def test_a_missing_channel_is_told_with_survey_and_effect(
     tmp_path: Path, folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -1,7 +1,8 @@
-"""Whether a survey was recorded with averages as the calibration's was: its own lengths |b| tell.
+"""What a survey's own lengths |b| say of the effects that a calibration takes off it.
 
-All sensors are averaged alike, and nothing that the sensors differ by shows it; but a mean is shorter than what it is
-made of, by an amount that goes with the square of the rate of turning.
+The sensors' differences show most effects and are looked at elsewhere. Rows that are averages they cannot show: all
+sensors are averaged alike, and a mean is shorter than what it is made of, by an amount that goes with the square of the
+rate of turning. And whatever was fitted to one survey may not carry over to another, which |b| - F shows.
 """
 
 from __future__ import annotations
@@ -29,20 +30,56 @@ def averaged_otherwise(
 ) -> bool:
     """Whether the lengths of a survey's outputs refute the `averaging` of a calibration.
 
-    What it would add to |b| is sought in |b| - F without it (in |b| where the survey has no total field), beside a
-    constant of each sensor. Less than half of it there, by four standard deviations of what else moves |b|, refutes it;
-    a survey that turns too slowly, or crosses too strong a field, to tell is taken to be recorded as the calibration's.
+    A survey that turns too slowly, or crosses too strong a field, to tell is taken to be recorded as the calibration's.
 
     Parameters
     ----------
     record: all samples of the survey, channels with the calibration's origins taken off.
     adopted: the effects, `averaging` among them; theta: their coefficients; good: (N,) the samples that count.
     """
-    others = [i for i, a in enumerate(adopted) if a.name != AVERAGING]
-    with_it = corrected_raw(record, calibration, adopted, theta, good)
+    number = next(i for i, a in enumerate(adopted) if a.name == AVERAGING)
+    b = calibration.apply(corrected_raw(record, calibration, adopted, theta, good))
+    return _refuted(record, calibration, adopted, theta, good, number, b)
+
+
+def contradicted(
+    record: Record,
+    calibration: ArrayCalibration,
+    adopted: Sequence[Adopted],
+    theta: Sequence[Array],
+    good: NDArray[np.bool_],
+    b: Array,
+) -> list[str]:
+    """The instrument's effects without which |b| would be nearer to the total field of a survey: they do not carry over
+    to it.
+
+    Parameters
+    ----------
+    record: all samples of the survey, as read but for its total field, which is without the base station's errors.
+    b: (N, S, 3) nT, with all effects taken off; the others as for `averaged_otherwise`.
+    """
+    own = [i for i, a in enumerate(adopted) if a.component.effect == "instrument"]
+    return [adopted[i].name for i in own if _refuted(record, calibration, adopted, theta, good, i, b)]
+
+
+def _refuted(
+    record: Record,
+    calibration: ArrayCalibration,
+    adopted: Sequence[Adopted],
+    theta: Sequence[Array],
+    good: NDArray[np.bool_],
+    number: int,
+    b: Array,
+) -> bool:
+    """Whether less than half of what one effect takes off the lengths is there.
+
+    It is sought in |b| - F without it (in |b| where the survey has no total field), beside a constant of each sensor,
+    and counts where it is missing by four standard deviations of what else moves |b|.
+    """
+    others = [i for i in range(len(adopted)) if i != number]
     without = corrected_raw(record, calibration, [adopted[i] for i in others], [theta[i] for i in others], good)
     lengths = np.linalg.norm(calibration.apply(without), axis=2)
-    course = np.linalg.norm(calibration.apply(with_it), axis=2) - lengths
+    course = np.linalg.norm(b, axis=2) - lengths
     left = lengths if record.total_field is None else lengths - record.total_field[:, None]
     use = good & np.isfinite(left).all(axis=1) & np.isfinite(course).all(axis=1)
     if not use.any():

@@ -18,7 +18,7 @@ from magtensor.error_models.waveform import NAME
 from magtensor.errors import DataError, UsageError
 from magtensor.loop.correcting.another_survey import LONG, TONE, as_dated_here, shows_a_state, unknown
 from magtensor.loop.correcting.correction import corrected_raw, corrected_reference, hidden_objection
-from magtensor.loop.correcting.lengths import AVERAGING, averaged_otherwise
+from magtensor.loop.correcting.lengths import AVERAGING, averaged_otherwise, contradicted
 from magtensor.loop.fitting.model import Adopted, Record, unread
 from magtensor.loop.fitting.record import record_of
 from magtensor.registry import Registry
@@ -183,6 +183,27 @@ def those_here(
 def _without(here: Here, name: str, **words: str) -> Here:
     kept = [i for i, a in enumerate(here.adopted) if a.name != name]
     return replace(here, adopted=[here.adopted[i] for i in kept], theta=[here.theta[i] for i in kept], **words)
+
+
+def contradicted_here(
+    before: Survey,
+    cleaned: Survey,
+    fitted: ArrayCalibration,
+    adopted: Sequence[Adopted],
+    theta: Sequence[Array],
+    origins: Mapping[str, Array],
+) -> str:
+    """Which effects that were taken off a survey its own total field contradicts; "" where none is, or there is none.
+
+    Args:
+        before: the survey as it was read; cleaned: without the effects.
+    """
+    if "total_field" not in cleaned or not any(a.component.effect == "instrument" for a in adopted):
+        return ""
+    record = record_of(before, origins=origins, every=True)
+    record = replace(record, total_field=np.asarray(cleaned.values("total_field"), dtype=float))
+    b = fitted.apply(np.asarray(cleaned.values("b_raw"), dtype=float))
+    return ", ".join(dict.fromkeys(contradicted(record, fitted, adopted, theta, cleaned.good, b)))
 
 
 def begun_with(adopted: Sequence[Adopted], begun: datetime, survey: Survey) -> list[Adopted]:
