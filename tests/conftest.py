@@ -6,9 +6,10 @@ import os
 from collections.abc import Iterator
 
 import pytest
-from hypothesis import settings
+from hypothesis import HealthCheck, settings
 
-settings.register_profile("seeded", derandomize=True)
+# a machine that others use too makes examples slowly
+settings.register_profile("seeded", derandomize=True, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("seeded")
 os.environ["MAGTENSOR_PROCESSES"] = "1"  # the tests themselves share the cores
 

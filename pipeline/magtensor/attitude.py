@@ -38,6 +38,14 @@ def into_platform(attitude: Array, world: Array) -> Array:
     return out
 
 
+def continuous(quaternions: Array) -> Array:
+    """The same rotations with signs that do not jump, so that they can be interpolated."""
+    dots = np.einsum("ij,ij->i", quaternions[1:], quaternions[:-1])
+    flips = np.where(np.nan_to_num(dots, nan=1.0) < 0, -1.0, 1.0)
+    out: Array = quaternions * np.concatenate(([1.0], np.cumprod(flips)))[:, None]
+    return out
+
+
 def to_world(attitude: Array) -> Array:
     """(N, 3, 3): the rotation from the platform into the world; row k is the world's axis k in the platform frame."""
     return np.stack([into_platform(attitude, axis) for axis in np.eye(3)], axis=1)

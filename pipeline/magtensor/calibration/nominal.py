@@ -190,8 +190,7 @@ def fit_nominal(
 
     Raises
     ------
-    NotEnoughData: fewer than `LEAST_SAMPLES`, more than half of the samples disagree with any calibration, or nothing
-        tells a single sensor's error from the field.
+    NotEnoughData: fewer than `LEAST_SAMPLES`, or more than half of the samples disagree with any calibration.
     DataError: the sensors do not see one field, or a parameter lies beyond the prior.
     """
     sensors = raw.shape[1]
@@ -205,11 +204,6 @@ def fit_nominal(
         )
     if np.median(np.abs(raw)) > LARGEST * np.mean(total_field):
         raise DataError("the outputs are no field near the total field", hint="look for wrong units")
-    if sensors == 1 and not np.ptp(total_field) > 0:
-        raise NotEnoughData(
-            "one sensor beside a total field that is a constant: what the sensor adds cannot be told from the field",
-            hint="a measured total field, a second sensor, or attitudes all round would tell",
-        )
     flat = raw.reshape(len(raw), -1)
     unit = float(np.mean(total_field[believed]))
     std = nominal.std(sensors)

@@ -17,7 +17,7 @@ from magtensor.errors import DataError, NotEnoughData, UsageError, did_you_mean
 from magtensor.loop.decisions import Decision
 from magtensor.loop.fitting.model import Adopted, Fitting, Record, State, as_declared
 from magtensor.loop.fitting.record import record_of
-from magtensor.loop.fitting.refit import joint_state, without
+from magtensor.loop.fitting.refit import joint_state, require_more_than_a_constant, without
 from magtensor.loop.fitting.wandering import unweighed
 from magtensor.loop.long_record import on_every_sample, part_of
 from magtensor.loop.searching import by_hand
@@ -92,6 +92,7 @@ class Inquiry:
     def now(self) -> Moment:
         """Where it stands; the first fit is made when it is first asked for."""
         if not self._history:
+            require_more_than_a_constant(self._part.record, self.how)
             state = joint_state(self._part.record, self.declared, self.how)
             self._history.append(Moment(self._part.record, state, self.how, (DECLARED,) * len(self.declared)))
         return self._history[-1]

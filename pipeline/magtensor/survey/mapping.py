@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from magtensor.attitude import continuous
 from magtensor.errors import DataError
 from magtensor.survey.altitude import dipole_decrease, pressure_height
 from magtensor.survey.canonical import expected
@@ -173,7 +174,7 @@ class _Mapper:
         if section.maps == "world to platform":
             found = found * np.array([-1.0, -1.0, -1.0, 1.0])
         if rows is not self.rows:
-            found = self.at_array_times(rows, _continuous(found), section.max_gap_s, "attitude")
+            found = self.at_array_times(rows, continuous(found), section.max_gap_s, "attitude")
             found = found / np.linalg.norm(found, axis=1, keepdims=True)
         attributes = {"units": "1", "long_name": "platform to world, scalar last"}
         return ("time", "quaternion"), found, {**attributes, **({"world": section.world} if section.world else {})}
@@ -322,13 +323,6 @@ def _reference(
 
 def _why(text: str) -> dict[str, str]:
     return {"why": text} if text else {}
-
-
-def _continuous(quaternions: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The same rotations with signs that do not jump, so that they can be interpolated."""
-    dots = np.einsum("ij,ij->i", quaternions[1:], quaternions[:-1])
-    flips = np.where(np.nan_to_num(dots, nan=1.0) < 0, -1.0, 1.0)
-    return quaternions * np.concatenate(([1.0], np.cumprod(flips)))[:, None]
 
 
 def euler_quaternion(

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from magtensor.attitude import continuous
 from magtensor.between_readings import COURSES
 from magtensor.calibration.types import Array
 from magtensor.error_models.held_logs import LEAST_HELD, LEAST_READINGS
@@ -58,6 +59,12 @@ def record_of(
             use = _where_read(use, time, station)
     logged, units = channels_of(survey)
     absent = []
+    attitude, known = _attitude(survey)
+    if attitude is not None and known[use].sum() < MOSTLY * use.sum():
+        attitude = None
+        absent.append("attitude")
+    elif not steady and (~known)[use].sum() <= FEW * use.sum():
+        use &= known
     for name, values in list(logged.items()):
         finite = np.asarray(np.isfinite(values.reshape(len(values), -1)).all(axis=1))
         if not finite.all():
@@ -87,7 +94,7 @@ def record_of(
         run=runs(time, segment),
         segment=segment,
         position=np.asarray(survey.values("position"), dtype=float) if "position" in survey else None,
-        attitude=np.asarray(survey.values("attitude"), dtype=float) if "attitude" in survey else None,
+        attitude=attitude,
         samples=np.arange(len(time)),
         absent=tuple(absent),
     )
@@ -171,6 +178,22 @@ def _quiet(station: Station | None, time: Array, total_field: Array | None) -> A
     if total_field is None or station is None:
         return total_field
     return np.where(np.isfinite(total_field), station.at(time), np.nan)
+
+
+def _attitude(survey: Survey) -> tuple[Array | None, NDArray[np.bool_]]:
+    """Quaternions (N, 4), and whether each is known (N,): between two that are, what lies between them stands in."""
+    time = survey.time
+    if "attitude" not in survey:
+        return None, np.ones(len(time), dtype=bool)
+    values = np.asarray(survey.values("attitude"), dtype=float)
+    finite: NDArray[np.bool_] = np.asarray(np.linalg.norm(np.nan_to_num(values), axis=1) > 0)
+    finite &= np.isfinite(values).all(axis=1)
+    if finite.all() or not finite.any():
+        return values, finite
+    read = continuous(values[finite])
+    filled = np.column_stack([np.interp(time, time[finite], column) for column in read.T])
+    filled /= np.linalg.norm(filled, axis=1, keepdims=True)
+    return np.where(finite[:, None], values, filled), _known(time, finite)
 
 
 def _known(time: Array, finite: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -18,7 +18,7 @@ from magtensor.calibration.types import Array
 from magtensor.error_models.delays import cleared
 from magtensor.error_models.excitation import Excitation
 from magtensor.error_models.terms import Terms, joined
-from magtensor.errors import NotEnoughData
+from magtensor.errors import DataError, NotEnoughData
 from magtensor.loop.evidence.assessment import WHITE, Colours, colours_of, estimated, log_likelihood
 from magtensor.loop.evidence.residual import Residual, quick, residual_of, taken_off
 from magtensor.loop.evidence.statistics import Estimate
@@ -28,6 +28,7 @@ from magtensor.loop.fitting.seen import beside_the_site, excitation_of
 
 MOST_ROUNDS = 6
 _SLACK = 4.0  # in the error accepted while an effect may yet turn out to cause most of it
+CONSTANT = 1e-9  # of the total field: what interpolation makes of one
 SETTLED = 0.02  # of a standard deviation
 HARDLY_SHOWN = 1e3  # times the variance that a coefficient would have alone
 SHOWN = 3.0  # standard deviations
@@ -63,7 +64,10 @@ def joint_state(
     for round_ in range(MOST_ROUNDS):
         # what attitudes can determine nobody asks between the first fit and the last
         known = None if fit is None or round_ + 1 == MOST_ROUNDS else fit.coverage
-        fit = _fit(record, adopted, raw, reference, how, keep, known, fit)
+        if fit is None:
+            fit = _begun(record, adopted, theta, how, keep)
+        else:
+            fit = _fit(record, adopted, raw, reference, how, keep, known, fit)
         x = beside_the_site(excitation_of(record, fit, raw, lines, seen), adopted, theta)
         if not adopted:
             break
@@ -101,6 +105,26 @@ def joint_state(
     return _state(record, adopted, theta, fit, raw, reference, how, x, estimate, lines)
 
 
+def _begun(
+    record: Record,
+    adopted: Sequence[Adopted],
+    theta: Sequence[Array],
+    how: Fitting,
+    keep: NDArray[np.bool_] | None,
+) -> JointFit:
+    """The fit of the outputs as they are; where that is refused, for they hold an effect as strong as the field, of the
+    outputs without what the coefficients add, the regressors made of the outputs themselves."""
+    try:
+        return _fit(record, adopted, record.raw, record.total_field, how, keep)
+    except DataError:
+        if not any(t.any() for t in theta):
+            raise
+        each = [a.terms(record.excitation(record.raw, record.raw)) for a in adopted]
+        if [len(t) for t in theta] != [e.count for e in each]:
+            raise
+    return _fit(record, adopted, *without(record, each, theta), how, keep)
+
+
 def _state(
     record: Record,
     adopted: Sequence[Adopted],
@@ -121,6 +145,23 @@ def _state(
     terms = joined([a.terms(x) for a in adopted]).at(residual.samples) if adopted else None
     left_out = None if residual is entire else entire
     return State(tuple(adopted), tuple(theta), fit, residual, x, terms, estimate, tuple(lines), left_out)
+
+
+def require_more_than_a_constant(record: Record, how: Fitting) -> None:
+    """Refuse a single sensor near nominal that has but a constant to be compared with.
+
+    Raises
+    ------
+    NotEnoughData: nothing tells what the sensor adds from the field.
+    """
+    field = record.total_field
+    if how.nominal is None or field is None or record.raw.shape[1] > 1:
+        return
+    if np.ptp(field) < CONSTANT * np.mean(field):
+        raise NotEnoughData(
+            "one sensor beside a total field that is a constant: what the sensor adds cannot be told from the field",
+            hint="a measured total field, a second sensor, or attitudes all round would tell",
+        )
 
 
 def without_noise(theta: Array, estimate: Estimate) -> Array:

@@ -39,9 +39,13 @@ _RESTS = 0.02  # relative: a setting that moves no further is settled
 
 def adopt(record: Record, state: State, chosen: Candidate, how: Fitting) -> State:
     """Refit with the chosen model, first on all sensors, then on those that show it."""
-    after, which = on_all_sensors(record, state, chosen, how), len(state.adopted)
-    sensors = _needed(after, which)
-    return after if sensors is None else narrowed(record, after, which, sensors, how)
+    return on_those_needed(record, on_all_sensors(record, state, chosen, how), len(state.adopted), how)
+
+
+def on_those_needed(record: Record, state: State, which: int, how: Fitting) -> State:
+    """Refit with one of the models on those of its sensors that need it."""
+    sensors = _needed(state, which)
+    return state if sensors is None else narrowed(record, state, which, sensors, how)
 
 
 def on_all_sensors(record: Record, state: State, chosen: Candidate, how: Fitting) -> State:
@@ -79,9 +83,7 @@ def on_those_that_show(record: Record, state: State, how: Fitting, fixed: int) -
     for which in range(fixed, len(state.adopted)):
         if state.adopted[which].name == NAME or len(state.adopted) == fixed + 1:
             continue
-        sensors = _needed(state, which)
-        if sensors is not None:
-            state = narrowed(record, state, which, sensors, how)
+        state = on_those_needed(record, state, which, how)
     return state
 
 

@@ -88,6 +88,15 @@ def _judged(candidate: Candidate, record: Record, state: State, how: Fitting) ->
         after = joint_state(record, [*state.adopted, candidate.model], how, start, state.lines, state.fit.keep)
     except DataError:
         return None
+    before, terms, found = at_its_fit(after)
+    moved = [t - s for t, s in zip(after.theta, state.theta, strict=False)]
+    theta = found.theta + np.concatenate([*moved, np.zeros(terms.count)])
+    return before, terms, replace(found, theta=theta)
+
+
+def at_its_fit(after: State) -> tuple[State, Terms, Assessment]:
+    """What the last of the models is judged against at the fit with it, all models left out, which no other process
+    could send back; its terms there, and what the data say of them."""
     assert after.terms is not None
     own = slices(after)[-1]
     terms = after.terms.only(range(own.start, own.stop))
@@ -95,9 +104,5 @@ def _judged(candidate: Candidate, record: Record, state: State, how: Fitting) ->
     residual = put_back(after.residual, terms, after.theta[-1])
     before = replace(after, adopted=(), theta=after.theta[:-1], residual=residual, terms=given)
     colours = colours_of(residual)
-    found = assess(
-        Whitened.of(residual, colours.across, colours.along, given), terms, once=happens_once(candidate.model)
-    )
-    moved = [t - s for t, s in zip(after.theta, state.theta, strict=False)]
-    theta = found.theta + np.concatenate([*moved, np.zeros(terms.count)])
-    return before, terms, replace(found, theta=theta)
+    once = happens_once(after.adopted[-1])
+    return before, terms, assess(Whitened.of(residual, colours.across, colours.along, given), terms, once=once)

@@ -19,7 +19,7 @@ from magtensor.error_models.excitation import Excitation
 from magtensor.error_models.needs import in_words, missing
 from magtensor.errors import DataError
 from magtensor.loop.fitting.model import Adopted, Fitting, Record, State, of_the_site
-from magtensor.loop.fitting.refit import joint_state, loud_stretches, settled
+from magtensor.loop.fitting.refit import joint_state, loud_stretches, require_more_than_a_constant, settled
 from magtensor.loop.fitting.trial import on_the_folds_of, trial
 from magtensor.loop.fitting.wandering import all_noise, narrowed_to, of_sensors, quieter, unweighed
 from magtensor.loop.remainder.flagged import lasting
@@ -30,6 +30,7 @@ from magtensor.loop.searching.gates import ALPHA
 from magtensor.loop.searching.latent import NAME, SINGLE_STRETCH, renewed, sought
 from magtensor.loop.searching.overshadowed import overshadowed
 from magtensor.loop.searching.rounds import Ended, Rounds, with_lines
+from magtensor.loop.searching.strong_event import begun_with
 
 MOST_EFFECTS = 8
 
@@ -65,10 +66,17 @@ def search(
             _require_channels(joint_state(record, sources, how).excitation, declared)
     first = joint_state(record, declared, how)
     rounds = Rounds(models, len(declared), most_effects, alpha, lines, say)
-    ended = _without_what_is_loud(rounds.run(record, first, how), rounds)
+    begun = None if how.nominal is None else begun_with(record, models, first, how, alpha)
+    if begun is None:
+        require_more_than_a_constant(record, how)
+        ended = rounds.run(record, first, how)
+    else:
+        ended = rounds.run(record, begun.state, begun.how)
+        ended = replace(ended, steps=(begun.step, *ended.steps))
+    ended = _without_what_is_loud(ended, rounds)
     if len(ended.state.adopted) - len(declared) < most_effects:
         ended = _without_what_is_wrong(ended, rounds)
-        if how.nominal is None:
+        if ended.how.nominal is None:
             ended = _without_those_that_wander(ended, rounds)
     record, state, how, steps = ended.record, ended.state, ended.how, ended.steps
     shown = on_those_that_show(record, state, how, len(declared))
