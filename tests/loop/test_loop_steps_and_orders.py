@@ -111,3 +111,16 @@ def test_noise_of_the_base_station_is_no_delay_of_it(tmp_path: Path) -> None:
     assert searched(noisy, "reference_clock").last.adopted == ()
     (adopted,) = searched(replace(record, total_field=late, quiet_field=quiet), "reference_clock").last.adopted
     np.testing.assert_allclose(adopted.settings["lag_s"], 40.0, atol=10.0)
+
+
+@pytest.mark.parametrize("part", [pytest.param(0.5, marks=pytest.mark.long), 0.9])
+def test_a_jump_while_a_posture_is_held_has_its_time_to_a_sample(tmp_path: Path, part: float) -> None:
+    """The turns, which nobody recorded, are longer than the samples about the time that white noise shows."""
+    rest, turn, at = 2.0, 2.1, 58
+    time = at * (rest + turn) + part * rest
+    postures = {"type": "postures", "random_count": 136, "rest_s": rest, "turn_s": turn}
+    jump = {"type": "offset_step", "rms_nT": 3.0, "time_s": [time]}
+    found = searched(loaded(tmp_path, scenario(5, jump, motion=postures, rate_Hz=10.0)), "offset_step", "offset_while")
+    (adopted,) = found.last.adopted
+    assert (adopted.name, adopted.sensors) == ("offset_step", ())
+    assert adopted.settings["time_s"] == pytest.approx(time, abs=0.1)

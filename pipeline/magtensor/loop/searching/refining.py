@@ -60,7 +60,7 @@ def refined(model: Component, settings: dict[str, Any], state: State, failed: di
             best = max([best, *finer], key=gain)
             low, high = best - (finer[1] - finer[0]), best + (finer[1] - finer[0])
         if isinstance(grid, EventTimes):
-            best = _its_time(gain, Scorer(residual, given, WHITE), at, (low, high), best, state.excitation.spacing)
+            best = _its_time(gain, Scorer(residual, given, WHITE), at, (low, high), best, state.excitation)
         else:
             best = golden(gain, low, high, best, _OF_A_LINE if isinstance(grid, Frequencies) else REFINEMENTS)
         if low <= 0.0 <= high and of_ratios(grid) and gain(best) - gain(0.0) < SEPARATION / 2.0:
@@ -101,12 +101,13 @@ def _its_time(
     at: Callable[[float], Terms | None],
     limits: tuple[float, float],
     best: float,
-    spacing: float,
+    x: Excitation,
 ) -> float:
     """The time of an event between limits, s, to a sample.
 
     In white noise the way to it rises from afar. In noise of the colour that a large jump leaves only the very sample
-    explains anything: there it is sought among the samples about the time found in white noise.
+    explains anything: there it is sought among the samples about the time found in white noise, which may be in a pause
+    beside them.
     """
     low, high = limits
 
@@ -114,9 +115,11 @@ def _its_time(
         found = at(value)
         return -np.inf if found is None else white(found)
 
-    steps = int(np.clip(np.ceil(np.log(max((high - low) / spacing, 2.0)) / _GOLDEN), REFINEMENTS, _OF_A_LINE))
+    steps = int(np.clip(np.ceil(np.log(max((high - low) / x.spacing, 2.0)) / _GOLDEN), REFINEMENTS, _OF_A_LINE))
     about = golden(in_white, low, high, best, steps)
-    near = about + spacing * np.arange(-_SAMPLES_ABOUT, _SAMPLES_ABOUT + 1)
+    between = (x.elapsed[1:] + x.elapsed[:-1]) / 2.0
+    after = int(np.searchsorted(between, about))
+    near = between[max(after - _SAMPLES_ABOUT, 0) : after + _SAMPLES_ABOUT]
     from_afar = golden(gain, low, high, best)
     return max((float(v) for v in (best, from_afar, *near)), key=gain)
 
