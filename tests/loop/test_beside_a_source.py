@@ -10,6 +10,7 @@ import pytest
 from loop_cases import BASE, RECIPE, adopted_names, scenario, survey_file, verdict_of
 from scipy.spatial.transform import Rotation
 
+import magtensor
 from magtensor.loop.fitting.model import Adopted, Fitting, Record
 from magtensor.loop.fitting.record import record_of
 from magtensor.loop.fitting.refit import joint_state
@@ -98,3 +99,18 @@ def test_both_are_fitted_from_nothing(record: Record) -> None:
     state = joint_state(record, adopted, Fitting())
     assert state.residual.square() < 1.5
     assert np.abs(state.theta[1]).max() < 2.0  # mm
+
+
+@pytest.mark.parametrize("seed", [3, pytest.param(1, marks=pytest.mark.long)])
+def test_what_an_effect_adds_along_the_vectors_of_a_source_is_not_left_in_its_waveform(
+    tmp_path: Path, seed: int
+) -> None:
+    """A waveform may be anything: it takes what goes with the field and the temperature along its vectors, and of scale
+    factors that follow the temperature what is left of them looks like axes that turn."""
+    vectors = 8.0 * np.array([[0.9, -0.4, 0.6], [-0.5, 0.8, 0.1], [0.2, 0.5, -0.9], [0.7, -0.6, 0.3]])
+    waveform = {"type": "smooth", "rms": 1.0, "time_s": 3.0}
+    source = {"type": "latent_source", "nT_per_unit": vectors.tolist(), "waveform_of": waveform}
+    survey = survey_file(tmp_path, scenario(seed, source, {"type": "temperature_scale", "rms_nT": 0.3}))
+    names = ["latent_source", "temperature_scale", "temperature_alignment", "channel_response"]
+    found = magtensor.close_loop(survey, search=names)
+    assert {a["error_model"] for a in found.verdict["adopted"]} == {"latent_source", "temperature_scale"}

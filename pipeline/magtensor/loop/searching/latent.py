@@ -51,6 +51,8 @@ from magtensor.loop.searching.likeness import (
 LEAST_SENSORS = 3  # from here on noise of single sensors does not imitate a factor
 QUIET = 5.0  # times the median square of a step: of a few dozen values none is as large by chance
 LEVEL_ROUNDS = 3
+MOST_RENEWALS = 10
+SETTLED = 0.1  # of the noise of a sample, along the vectors of a source
 LEAST_NOISE = 0.1  # of what the fit believes
 IMPROPER = 1 / 3  # of the noise of a sensor's usual axis
 SINGLE_STRETCH = "it acts in a single short stretch, which no other can confirm"
@@ -266,18 +268,25 @@ def _told_from_the_field(residual: Residual, held: Array, direction: Array) -> C
 
 
 def renewed(record: Record, state: State, how: Fitting) -> tuple[Record, State]:
-    """The waveform once more, from a calibration that knows the source or another effect better, and a refit."""
-    every = state.unabridged
-    found = _put_back(every)
-    if found is None:
-        return record, state
-    across, direction = found
-    course = _course_beside_the_field(across, np.eye(len(direction)) - every.residual.projector, direction, every)
-    if course.rms == 0:
-        return record, state
-    waveform = np.interp(record.time, record.time[every.residual.samples], course.values / course.rms)
-    record = replace(record, waveform=waveform)
-    return record, joint_state(record, state.adopted, how, state.theta, state.lines)
+    """The waveform once more, from a calibration that knows the source or another effect better, and a refit; again and
+    again, for of another effect the waveform has what lies along the source's vectors, and the effect's coefficients
+    have not, until both are known."""
+    for _ in range(MOST_RENEWALS):
+        every = state.unabridged
+        found = _put_back(every)
+        if found is None:
+            break
+        across, direction = found
+        course = _course_beside_the_field(across, np.eye(len(direction)) - every.residual.projector, direction, every)
+        if course.rms == 0:
+            break
+        waveform = np.interp(record.time, record.time[every.residual.samples], course.values / course.rms)
+        moved = waveform if record.waveform is None else waveform - record.waveform
+        record = replace(record, waveform=waveform)
+        state = joint_state(record, state.adopted, how, state.theta, state.lines)
+        if len(state.adopted) == 1 or float(np.std(moved) * np.linalg.norm(direction)) < SETTLED:
+            break
+    return record, state
 
 
 def _course_beside_the_field(across: Array, held: Array, direction: Array, state: State) -> Course:
