@@ -64,6 +64,19 @@ def test_noise_that_is_louder_for_a_while_is_dated() -> None:
     assert loud_words(linear_state(quiet), quiet, Fitting()) == []
 
 
+def test_noise_that_grows_is_told() -> None:
+    """It is nowhere twice as loud as usual, and at the end four times as at the beginning."""
+    rng = np.random.default_rng(4)
+    added = np.zeros((SAMPLES, 4, 3))
+    added[:, 1] = np.linspace(0.0, 0.6, SAMPLES)[:, None] * rng.standard_normal((SAMPLES, 3))
+    record = synthetic(4, SAMPLES, turning_s=4.0, noise_nT=0.15, added=added)
+    (words,) = loud_words(linear_state(record), record, Fitting())
+    times, here, there = (float(words.split()[i]) for i in (5, 10, 16))
+    assert "the noise of S2 is" in words
+    assert times == pytest.approx(np.hypot(0.57, 0.15) / np.hypot(0.03, 0.15), rel=0.2)  # the last tenth and the first
+    assert here == pytest.approx(0.9 * SAMPLES, abs=0.11 * SAMPLES) and there < 0.21 * SAMPLES
+
+
 @pytest.mark.parametrize(
     ("where", "told_of"),
     [

@@ -8,6 +8,7 @@ sensor whose matrix is not constant, or an error model that is significant and w
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -44,6 +45,7 @@ MUCH = 3.0  # times the white noise of an output: no base station beside a site 
 TWICE = 2.0  # what the slow noise of the sensors, known from few frequencies, makes of it
 MANY_FLAGGED = 0.01  # of the samples: of what is left, some is in these
 LOUD = 2.0  # times the usual noise
+PARTS = 10  # of a survey, that are compared
 NOISE = "what is left is noise: white, and slow noise of each sensor alone or of the reference"
 
 
@@ -178,13 +180,14 @@ def loud_words(state: State, record: Record, how: Fitting) -> list[str]:
     )
     words = []
     for name, own in pairs:
-        rough = np.sum(np.diff(seen.across[:, own], axis=0) ** 2, axis=1)
-        rough = median_filter(rough, size=ABOUT, mode="mirror")
+        steps = np.sum(np.diff(seen.across[:, own], axis=0) ** 2, axis=1)
+        rough = median_filter(steps, size=ABOUT, mode="mirror")
         usual = float(np.median(rough))
         loud = rough > LOUD**2 * usual
         edges = np.flatnonzero(np.diff(loud.astype(int), prepend=0, append=0)).reshape(-1, 2)
         found = [(first, end) for first, end in edges if end - first >= LEAST_LOUD]
         if not found:
+            words += growing_words(name, steps, record.time[seen.samples] - record.start)
             continue
         first, end = max(found, key=lambda stretch: stretch[1] - stretch[0])
         begin, until = (record.time[seen.samples[i]] - record.start for i in (first, end))
@@ -200,6 +203,23 @@ def loud_words(state: State, record: Record, how: Fitting) -> list[str]:
             "without them"
         )
     return words
+
+
+def growing_words(name: str, steps: Array, elapsed: Array) -> list[str]:
+    """Whether noise is much louder in one tenth of a survey than in another, as where it grows all the time.
+
+    Parameters
+    ----------
+    steps: (n - 1,) squares of the steps from one sample to the next; elapsed: (n,) s.
+    """
+    edges = np.linspace(0, len(steps), PARTS + 1).round().astype(int)
+    loudness = np.array([np.median(steps[i:j]) for i, j in pairwise(edges)])
+    quiet, loud = int(loudness.argmin()), int(loudness.argmax())
+    if np.diff(edges).min() < LEAST_LOUD or loudness[loud] < LOUD**2 * loudness[quiet]:
+        return []
+    times = float(np.sqrt(loudness[loud] / loudness[quiet]))
+    here, there = (f"from {elapsed[edges[k]]:.5g} to {elapsed[edges[k + 1]]:.5g} s" for k in (loud, quiet))
+    return [f"the noise of {name} is {times:.2g} times as loud {here} as {there}"]
 
 
 def excess_rms(state: State) -> float:
