@@ -17,6 +17,7 @@ def figure(value: float) -> str:
     return f"{value:.0f}" if 1e3 <= abs(value) < 1e6 else f"{value:.3g}"
 
 
+@np.errstate(over="ignore")  # of a fit that has run away an error is infinite, and that is what is asked
 def error_block(
     b: Array, total_field: Array | None, tensor: Array | None, good: np.ndarray, sensors: list[str]
 ) -> dict[str, Any]:

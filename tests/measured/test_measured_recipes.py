@@ -109,6 +109,35 @@ def test_broad_with_a_magnet_is_refused_a_scalar_calibration() -> None:
         run(found, empty_survey(found))
 
 
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("trial", "begin_s", "until_s", "magnet_nT"),
+    [
+        ("32_disturbed_attached_magnet_1cm", 40.0, 94.5, 58_000.0),
+        ("34_disturbed_attached_magnet_3cm", 45.5, 99.5, 13_500.0),
+    ],
+)
+def test_the_loop_names_the_magnet_that_comes_and_goes(
+    trial: str, begin_s: float, until_s: float, magnet_nT: float
+) -> None:
+    """Times and size as the outputs less the room's field show them, turned by the optical attitude, in parts of ten
+    seconds: the loop knows the lengths of the outputs only."""
+    import json
+
+    found = planned("loop_broad", "stages.close_loop.search=[offset_while,offset_step,passing_source]")
+    found = replace(found, survey=found.survey_for(RECIPES / f"../../../shared/data/broad/{trial}.hdf5"))
+    survey = run(found, empty_survey(found)).survey
+    verdict = json.loads(str(survey.values("loop/verdict")))
+    (adopted,) = verdict["adopted"]
+    assert adopted["error_model"] == "offset_while"
+    assert adopted["settings"]["time_s"] == pytest.approx(begin_s, abs=2.0)
+    assert adopted["settings"]["until_s"] == pytest.approx(until_s, abs=2.0)
+    z = next(c["value"] for c in adopted["coefficients"] if c["name"] == "z")
+    assert z == pytest.approx(magnet_nT, rel=0.1)
+    before, after = (verdict["held_out"][k]["total_field_rms_nT"]["all"] for k in ("before", "after"))
+    assert after < 0.3 * before, "one reading has 740 nT of noise"
+
+
 @pytest.mark.parametrize(("name", "left"), [("boulder", [0.5]), ("conrad", [0.1, 0.05])])
 def test_observatories(name: str, left: list[float]) -> None:
     survey = result(name, *QUICK[name])
