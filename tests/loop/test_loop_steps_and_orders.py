@@ -116,9 +116,9 @@ def test_noise_of_the_base_station_is_no_delay_of_it(tmp_path: Path) -> None:
 @pytest.mark.parametrize("part", [pytest.param(0.5, marks=pytest.mark.long), 0.9])
 def test_a_jump_while_a_posture_is_held_has_its_time_to_a_sample(tmp_path: Path, part: float) -> None:
     """The turns, which nobody recorded, are longer than the samples about the time that white noise shows."""
-    rest, turn, at = 2.0, 2.1, 58
+    rest, turn, at = 2.0, 2.1, 28
     time = at * (rest + turn) + part * rest
-    postures = {"type": "postures", "random_count": 136, "rest_s": rest, "turn_s": turn}
+    postures = {"type": "postures", "random_count": 60, "rest_s": rest, "turn_s": turn}
     jump = {"type": "offset_step", "rms_nT": 3.0, "time_s": [time]}
     found = searched(loaded(tmp_path, scenario(5, jump, motion=postures, rate_Hz=10.0)), "offset_step", "offset_while")
     (adopted,) = found.last.adopted
