@@ -8,6 +8,7 @@ each is asked to predict readings that it was not given.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Literal, get_args
 
 import numpy as np
@@ -39,7 +40,7 @@ def course(time: Floats, values: Floats, how: Course) -> Callable[[Floats], Floa
         how: monotone cubic (Fritsch and Carlson 1980, as PCHIP), cubic spline, or straight lines.
     """
     if how == "linear" or len(time) < 3:
-        return lambda at: np.interp(at, time, values)
+        return partial(_straight, time, values)  # which another process can be sent
     from scipy.interpolate import CubicSpline, PchipInterpolator, PPoly
 
     monotone = PchipInterpolator(time, values)
@@ -51,6 +52,10 @@ def course(time: Floats, values: Floats, how: Course) -> Callable[[Floats], Floa
             own = slice(first, last + 1)
             pieces[:, first:last] = CubicSpline(time[own], values[own]).c
     return PPoly(pieces, time)
+
+
+def _straight(time: Floats, values: Floats, at: Floats) -> Floats:
+    return np.interp(at, time, values)
 
 
 def followed_best(time: Floats, values: Floats) -> Course:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import pickle
+
 import numpy as np
 import pytest
 
-from magtensor.between_readings import breaks, course, followed_best, noise_gain
+from magtensor.between_readings import COURSES, Course, breaks, course, followed_best, noise_gain
+from magtensor.error_models.station import Station
 
 STEP_S = 5.0
 READ = np.arange(0.0, 2000.0, STEP_S)
@@ -72,3 +75,14 @@ def test_what_noise_the_spline_lets_through() -> None:
     assert len(found) > 2000
     np.testing.assert_allclose(found.std(axis=0), noise_gain("spline", place), rtol=0.06)
     np.testing.assert_allclose(noise_gain("pchip", place), np.hypot(1 - place, place))
+
+
+@pytest.mark.parametrize("how", COURSES)
+@pytest.mark.parametrize("count", [2, 90])
+def test_a_base_station_can_be_sent_to_another_process(how: Course, count: int) -> None:
+    """With the course that it has been asked for, as a search that shares its work out sends it back."""
+    time = np.arange(float(count))
+    station = Station(time, np.sin(time), how)
+    asked = np.linspace(0.0, count - 1.0, 7)
+    there = station.at(asked)
+    np.testing.assert_array_equal(pickle.loads(pickle.dumps(station)).at(asked), there)
