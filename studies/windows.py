@@ -9,8 +9,8 @@ of a recording should tell the same: what one of them adopts and no other bears 
 accusation. The recordings are not part of the project (docs/measured/README.md). Parts that are not in the table were
 not waited for. The fit with sensors near nominal has changed: the parts of Boulder, whose fits used to end anywhere
 (held-out errors of thousands of nT), are refused since. Of the others near nominal only the first two parts of the
-quadcopter were made again. The two of BROAD with a magnet, 32 and 34, are refused no longer (broad.md): their rows are
-from before.
+quadcopter were made again. The two of BROAD with a magnet, 32 and 34, led to the search for an event as strong as the
+field, of which they are no test.
 """
 
 from __future__ import annotations
