@@ -39,6 +39,7 @@ from magtensor.loop.evidence.shared_waveform import (
 from magtensor.loop.fitting.log_noise import brought_in
 from magtensor.loop.fitting.model import Adopted, Fitting, Record, State
 from magtensor.loop.fitting.refit import joint_state
+from magtensor.loop.searching.contribution import happens_once
 from magtensor.loop.searching.gates import OF_THE_LAW, Candidate, explained_before, explained_by, gained_of_a_log
 from magtensor.loop.searching.likeness import (
     effect_along,
@@ -269,9 +270,11 @@ def _told_from_the_field(residual: Residual, held: Array, direction: Array) -> C
 
 def renewed(record: Record, state: State, how: Fitting) -> tuple[Record, State]:
     """The waveform once more, from a calibration that knows the source or another effect better, and a refit; again and
-    again, for of another effect the waveform has what lies along the source's vectors, and the effect's coefficients
-    have not, until both are known."""
-    for _ in range(MOST_RENEWALS):
+    again beside an effect that lasts, for of that the waveform has what lies along the source's vectors, and the
+    effect's coefficients have not, until both are known. What happens once may be a part of the source, and would
+    share its waveform with it."""
+    lasting = any(a.name != NAME and not happens_once(a) for a in state.adopted)
+    for _ in range(MOST_RENEWALS if lasting else 1):
         every = state.unabridged
         found = _put_back(every)
         if found is None:
@@ -284,7 +287,7 @@ def renewed(record: Record, state: State, how: Fitting) -> tuple[Record, State]:
         moved = waveform if record.waveform is None else waveform - record.waveform
         record = replace(record, waveform=waveform)
         state = joint_state(record, state.adopted, how, state.theta, state.lines)
-        if len(state.adopted) == 1 or float(np.std(moved) * np.linalg.norm(direction)) < SETTLED:
+        if float(np.std(moved) * np.linalg.norm(direction)) < SETTLED:
             break
     return record, state
 
