@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 import magtensor
 from magtensor.calibration.another_centre import another_centre
+from magtensor.errors import NotEnoughData
 
 MAGNET = np.array([[9000.0, -4000, 60_000], [20_000, 15_000, -3000], [-8000, 2000, 13_000], [30_000, -30_000, 10_000]])
 RIVALS = ("offset_step", "offset_while", "offset_drift", "passing_source")
@@ -86,6 +87,12 @@ def test_it_is_named_and_the_calibration_is_as_good_as_without(
     assert error["after"]["total_field_rms_nT"]["all"] < 0.2  # 0.15 nT of noise an axis, 0.1 nT of the base station's
     assert "calibration" not in found.verdict  # it is determined
     assert not found.verdict["unexplained"]["present"]
+
+
+def test_without_leave_to_adopt_it_the_survey_is_refused(tmp_path: Path) -> None:
+    survey = beside_a_magnet(tmp_path, [0], 200.0, 400.0)
+    with pytest.raises(NotEnoughData, match="no ellipsoid comes nearer"):
+        magtensor.close_loop(survey, search=RIVALS, most_effects=0)
 
 
 @pytest.mark.parametrize(("missing", "kept"), [(0.03, True), (0.8, False)])

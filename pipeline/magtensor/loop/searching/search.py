@@ -66,7 +66,8 @@ def search(
             _require_channels(joint_state(record, sources, how).excitation, declared)
     first = joint_state(record, declared, how)
     rounds = Rounds(models, len(declared), most_effects, alpha, lines, say)
-    begun = None if how.nominal is None else begun_with(record, models, first, how, alpha)
+    strong = how.nominal is not None and most_effects > 0
+    begun = begun_with(record, models, first, how, alpha) if strong else None
     if begun is None:
         require_more_than_a_constant(record, how)
         ended = rounds.run(record, first, how)
