@@ -113,15 +113,15 @@ def test_broad_with_a_magnet_is_refused_a_scalar_calibration() -> None:
 @pytest.mark.parametrize(
     ("trial", "begin_s", "until_s", "magnet_nT"),
     [
-        ("32_disturbed_attached_magnet_1cm", 40.0, 94.5, 58_000.0),
-        ("34_disturbed_attached_magnet_3cm", 45.5, 99.5, 13_500.0),
+        ("32_disturbed_attached_magnet_1cm", 40.0, 94.5, 58_470.0),
+        ("34_disturbed_attached_magnet_3cm", 45.5, 99.5, 13_890.0),
     ],
 )
 def test_the_loop_names_the_magnet_that_comes_and_goes(
     trial: str, begin_s: float, until_s: float, magnet_nT: float
 ) -> None:
-    """Times and size as the outputs less the room's field show them, turned by the optical attitude, in parts of ten
-    seconds: the loop knows the lengths of the outputs only."""
+    """Times and z as the outputs less the room's field show them, turned by the optical attitude
+    (docs/measured/broad.md): the loop knows the lengths of the outputs only, and x and y less well."""
     import json
 
     found = planned("loop_broad", "stages.close_loop.search=[offset_while,offset_step,passing_source]")
@@ -133,7 +133,7 @@ def test_the_loop_names_the_magnet_that_comes_and_goes(
     assert adopted["settings"]["time_s"] == pytest.approx(begin_s, abs=2.0)
     assert adopted["settings"]["until_s"] == pytest.approx(until_s, abs=2.0)
     z = next(c["value"] for c in adopted["coefficients"] if c["name"] == "z")
-    assert z == pytest.approx(magnet_nT, rel=0.1)
+    assert z == pytest.approx(magnet_nT, abs=2_500.0), "the field of the room differs by some uT along the path"
     before, after = (verdict["held_out"][k]["total_field_rms_nT"]["all"] for k in ("before", "after"))
     assert after < 0.3 * before, "one reading has 740 nT of noise"
 
