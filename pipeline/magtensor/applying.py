@@ -179,12 +179,12 @@ def apply_and_refine(
     from magtensor.calibration.surveys.corrections import with_scatter
     from magtensor.dated import at_date_of
     from magtensor.effect_errors import taken_off
+    from magtensor.loop.correcting.beyond import extrapolated
     from magtensor.loop.correcting.stored import (
         begun_anew,
         bridged,
         cleaned,
         contradicted_here,
-        extrapolated,
         in_equilibrium,
         not_as_dated,
         on_its_clock,

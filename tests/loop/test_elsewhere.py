@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 import magtensor
 from magtensor.cli import status_of
 from magtensor.closed_loop import ClosedLoop
-from magtensor.loop.correcting.stored import effect_variables, extrapolated
+from magtensor.loop.correcting.beyond import extrapolated
+from magtensor.loop.correcting.stored import effect_variables
 from magtensor.loop.fitting.model import Adopted
 from magtensor.preparing import load_as
 from magtensor.recipe.plan import read_plan
@@ -168,6 +169,25 @@ def test_a_channel_is_judged_as_it_is_seen_through_the_lag(folder: Path, warmer:
     other = survey.merged({"temperature": (("time",), np.full_like(temperature, first), {"units": "degC"})})
     said = extrapolated(other, calibration, [model], {"temperature": np.zeros(1)})
     assert ("temperature, through a lag of 2e+04 s, goes" in said) is told and bool(said) is told
+
+
+@pytest.mark.parametrize(("times", "told"), [(1.2, False), (1.9, True)])
+def test_a_curve_of_the_sensor_in_a_stronger_field_is_told(folder: Path, times: float, told: bool) -> None:
+    """What grows in proportion with the field, or not at all, holds in any."""
+    path = folder / "clean.h5"
+    survey = load_as(read_plan(RECIPE, survey=path), path)
+    bent = ["nonlinearity_quadratic", "nonlinearity_cubic", "cross_field", "hysteresis"]
+    straight = ["offset_drift", "scale_drift", "eddy_current", "temperature_scale", "sampling_lag", "turn_step"]
+    registry = Registry.load()
+    models = [Adopted(registry.find("error_model", name), {}) for name in (*straight, *bent)]
+    stored = effect_variables(models, [np.zeros(0)] * len(models), {"temperature": np.zeros(1)}, survey)
+    calibration: Any = {"calibration/effects": SimpleNamespace(attrs=stored["calibration/effects"][2])}
+    raw = survey["b_raw"]
+    other = survey.merged({"b_raw": (("time", "sensor", "axis"), times * raw.values, dict(raw.attrs))})
+    said = extrapolated(other, calibration, models, {"temperature": np.zeros(1)})
+    parts = [part.split(": ") for part in said.split("; ") if part]
+    assert [name for name, _ in parts] == (bent if told else [])
+    assert all(f"{times:.3g} times as large" in what for _, what in parts)
 
 
 def test_spikes_of_another_survey_are_flagged(tmp_path: Path, folder: Path, plain: ClosedLoop) -> None:

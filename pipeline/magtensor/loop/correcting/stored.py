@@ -17,6 +17,7 @@ from magtensor.error_models.settings import NOT_KNOWN, AnyChannel, Beginning, Du
 from magtensor.error_models.waveform import NAME
 from magtensor.errors import DataError, UsageError
 from magtensor.loop.correcting.another_survey import LONG, TONE, as_dated_here, shows_a_state, unknown
+from magtensor.loop.correcting.beyond import seen_here
 from magtensor.loop.correcting.correction import corrected_raw, corrected_reference, hidden_objection
 from magtensor.loop.correcting.lengths import AVERAGING, averaged_otherwise, contradicted
 from magtensor.loop.fitting.model import Adopted, Record, unread
@@ -27,7 +28,6 @@ from magtensor.survey.model import Survey, Variable
 from magtensor.survey.times import split_since
 
 LATE = "the log of what an effect follows is late"
-MOST_BEYOND = 0.25  # of the range that a calibration has seen of a channel
 MISSES = 10.0  # times as long as between its readings: then a channel is missing
 LONG_PART = 0.01  # of a survey, at least
 
@@ -61,7 +61,7 @@ def effect_variables(
     ]
     attributes = {"channel_origins": json.dumps({k: np.asarray(v).tolist() for k, v in origins.items()})}
     attributes["start"] = started(survey).isoformat()
-    attributes["channel_ranges"] = json.dumps(_ranges(record_of(survey, origins, use=believed), adopted))
+    attributes |= seen_here(record_of(survey, origins, use=believed), adopted)
     return {"calibration/effects": (("effect",), np.array(texts, dtype=np.str_), attributes)}
 
 
@@ -304,36 +304,6 @@ def _lacking(effect: Adopted, record: Record) -> str:
     return ""
 
 
-def _ranges(record: Record, adopted: Sequence[Adopted]) -> dict[str, list[float]]:
-    """Least and largest value of each channel, its origin taken off, and of those that effects see through a lag; those
-    of several columns together."""
-    out = {name: [float(v.min()), float(v.max())] for name, v in record.logged.items()}
-    for effect in adopted:
-        out |= {what: [float(v.min()), float(v.max())] for what, _, v in _followed(effect, record)}
-    return out
-
-
-def extrapolated(survey: Survey, calibration: Survey, adopted: Sequence[Adopted], origins: Mapping[str, Array]) -> str:
-    """Which effects follow a channel beyond what the calibration has seen of it, and how far; "" where none does."""
-    known = calibration["calibration/effects"].attrs.get("channel_ranges") if adopted else None
-    if known is None or not survey.good.any():
-        return ""
-    seen, record = json.loads(str(known)), record_of(survey, origins, use=survey.good)
-    words = []
-    for effect in (a for a in adopted if a.component.effect != "site"):  # what belongs to a site is not taken off
-        for what, channel, values in _followed(effect, record):
-            if what not in seen:  # of 2026: channels alone
-                what, values = channel, record.logged[channel]
-            if what not in seen:
-                continue
-            low, high = seen[what]
-            beyond = max(low - float(values.min()), float(values.max()) - high)
-            if beyond > MOST_BEYOND * (high - low):
-                units = f" {record.units[channel]}" if record.units[channel] else ""
-                words.append(f"{effect.name}: {what} goes {beyond:.3g}{units} beyond what the calibration has seen")
-    return "; ".join(dict.fromkeys(words))
-
-
 def bridged(survey: Survey, adopted: Sequence[Adopted]) -> str:
     """Which effects follow a channel that is missing for a while, and when: it is taken to go straight there; "" where
     none is."""
@@ -354,21 +324,6 @@ def bridged(survey: Survey, adopted: Sequence[Adopted]) -> str:
             if end - begin > max(MISSES * float(np.median(np.diff(read))), LONG_PART * known[-1]):
                 words.append(f"{effect.name}: {channel} is missing from {begin:.4g} to {end:.4g} s after the start")
     return "; ".join(dict.fromkeys(words))
-
-
-def _followed(effect: Adopted, record: Record) -> list[tuple[str, str, Array]]:
-    """What an effect follows: in words, the channel, and its values, seen through the effect's lag from equilibrium."""
-    x = record.excitation(record.raw, record.raw)
-    lag = float(effect.settings.get("lag_s", 0.0))
-    out = []
-    for name, mark in profiled(effect.component).items():
-        if isinstance(mark, AnyChannel):
-            channel = str(effect.settings.get(name, "")) or (mark.values(x) or [""])[0]
-            if channel in record.logged:
-                late = lag > 0.0 and not effect.settings.get("delayed", False)
-                values = x.lagged(x.channel(channel), lag) if late else x.channel(channel)
-                out.append((f"{channel}, through a lag of {lag:.4g} s," if late else channel, channel, values))
-    return out
 
 
 def left_in(survey: Survey, adopted: Sequence[Adopted]) -> str:
