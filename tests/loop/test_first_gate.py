@@ -194,3 +194,25 @@ def test_an_effect_of_one_sensor_leaves_nothing_in_the_others(of_sensor: int, ma
     (found,) = candidates_of(state, [registry.find("error_model", "offset_drift")], {}, ALPHA)
     assert (found.beside > 0.0) is may and found.passes is not may
     assert found.assessment.gain.total < SECOND_ORDER * explained_before(state)
+
+
+@pytest.mark.parametrize(("course", "may"), [("drift", False), ("fifth order", True)])
+def test_what_follows_the_field_leaves_nothing_that_goes_with_time(course: str, may: bool) -> None:
+    """S1 has a strong third order: what drifts is no next order of that, and a fifth order may be."""
+    registry = Registry.load()
+    raw = synthetic(23, noise_nT=0.15, turning_s=4.0).raw[:, 0] / 5e4
+    added = np.zeros((1200, 4, 3))
+    added[:, 0] = 600.0 * raw**3
+    if course == "drift":
+        added[:, 0] += np.linspace(-0.3, 0.3, 1200)[:, None] * np.array([1.0, -1.0, 1.0])
+        name = "offset_drift"
+    else:
+        added[:, 0] += 3.0 * (raw**5 - raw**3)
+        name = "hysteresis"
+    record = synthetic(23, noise_nT=0.15, turning_s=4.0, added=added)
+    third = Adopted(registry.find("error_model", "nonlinearity_cubic"), {}, ("S1",))
+    state = with_lines(joint_state(record, [third], Fitting()), record)
+    (found,) = candidates_of(state, [registry.find("error_model", name)], {}, ALPHA)
+    assert (found.beside > 0.0) is may
+    if not may:
+        assert found.passes and found.assessment.gain.total < SECOND_ORDER * explained_before(state)

@@ -266,7 +266,7 @@ def _assessed(state: State, model: Adopted, tried: int, alpha: float) -> Candida
     log_noise = brought_in(state, follows)  # flat where a switched channel rests, a curve has less of it
     return Candidate(
         model, tried, terms, assessment, assessment.p * tried, assessment.own_p * tried, assessment.null_p * tried,
-        alpha, log_noise, explained_beside(state, terms, assessment),
+        alpha, log_noise, explained_beside(state, model, terms, assessment),
     )  # fmt: skip
 
 

@@ -13,28 +13,32 @@ from typing import Any
 import numpy as np
 
 from magtensor.error_models.excitation import Excitation
+from magtensor.error_models.needs import FACTS
 from magtensor.error_models.settings import Duration, EventTimes, Range, profiled
 from magtensor.error_models.terms import Terms
 from magtensor.loop.evidence.assessment import NEARLY_ALL, Assessment
 from magtensor.loop.fitting.log_noise import channels_of
-from magtensor.loop.fitting.model import Adopted, State
-from magtensor.loop.searching.contribution import moments
+from magtensor.loop.fitting.model import Adopted, State, generic
+from magtensor.loop.searching.contribution import a_tone, moments
 from magtensor.loop.searching.gates import Candidate, explained_by, seen_between
 
 MOST = 0.5  # of what a candidate explains
 TIME = " time"  # no channel has that name
 
 
-def explained_beside(state: State, terms: Terms, assessment: Assessment) -> float:
+def explained_beside(state: State, model: Adopted, terms: Terms, assessment: Assessment) -> float:
     """Sum of squares that the adopted models explain whose next order may be all that a candidate shows: not of the
-    reference what differs between the sensors, nor of some sensors what others show."""
+    reference what differs between the sensors, nor of some sensors what others show, nor of what follows the field
+    alone what is added to the axes with a channel or with time."""
     between = seen_between(state.residual, terms, assessment.estimate.theta[-terms.count :])
+    apart = terms.adds_to_axes and not generic(model) and bool(drivers(model, state.excitation))
     return explained_by(
         state,
         [
             place
             for place, other in enumerate(state.adopted)
             if not (between and other.component.effect == "reference")
+            and not (apart and _of_the_field_alone(other, state.excitation))
             and (not other.sensors or _held_by(other.sensors, state, terms, assessment) > MOST)
         ],
     )
@@ -76,6 +80,14 @@ def _same_moment(model: Adopted, other: Adopted, x: Excitation) -> bool:
     angles, and what one leaves there the other explains exactly."""
     mine, theirs = (np.searchsorted(x.elapsed, moments(m)) for m in (model, other))
     return mine.size > 0 and mine.shape == theirs.shape and bool(np.all(mine == theirs))
+
+
+def _of_the_field_alone(model: Adopted, x: Excitation) -> bool:
+    """Whether what a sensor adds follows the field that it sees, and nothing else, so that the next order of it does
+    too: a curve, a delay, a conductor."""
+    component = model.component
+    known = all(need in FACTS for need in component.declared({}).needs)
+    return component.effect == "instrument" and known and not (a_tone(model) or generic(model) or drivers(model, x))
 
 
 def _of_time(grid: Any) -> bool:

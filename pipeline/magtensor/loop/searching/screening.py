@@ -55,7 +55,7 @@ def candidates_of(state: State, models: Sequence[Component], failed: dict[str, s
     candidates = [
         Candidate(
             model, tried, terms, assessment, p, own_p, null_p, alpha, _log_noise(state, model, terms, assessment),
-            explained_beside(state, terms, assessment),
+            explained_beside(state, model, terms, assessment),
             explained_by_kin(state, model, terms, assessment),
         )
         for (model, tried, terms, assessment), p, own_p, null_p in zip(found, adjusted, own, null, strict=True)

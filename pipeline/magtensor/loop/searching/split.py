@@ -124,5 +124,5 @@ def _assessed(state: State, place: int, name: str, pair: tuple[float, float], al
     log_noise = brought_in(state, channels_of(model, state.excitation))
     return Candidate(
         other, tried, both, assessment, assessment.p * tried, assessment.own_p * tried, assessment.null_p * tried,
-        alpha, log_noise, explained_beside(state, both, assessment), moved=(place, one),
+        alpha, log_noise, explained_beside(state, other, both, assessment), moved=(place, one),
     )  # fmt: skip
