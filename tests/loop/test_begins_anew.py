@@ -147,3 +147,36 @@ def test_beside_a_source_that_nobody_logged(tmp_path: Path) -> None:
     with h5py.File(later) as file:
         error = np.linalg.norm(there["calibrated/b"], axis=2) - file["truth/total_field_true"][()][:, None]
     assert np.sqrt(np.mean(error**2)) < 0.3  # twice the noise; the source moves |b| by 1.7 nT, the drift by 0.6
+
+
+def of_two(path: Path) -> None:
+    """The first two sensors of a survey alone."""
+    with h5py.File(path, "r+") as file:
+        for name in ("b_raw", "position", "sensor"):
+            values, attributes = file[name][()], dict(file[name].attrs)
+            del file[name]
+            file[name] = values[:, :2] if name == "b_raw" else values[:2]
+            file[name].attrs.update(attributes)
+
+
+@pytest.mark.parametrize("later_s", [0.0, 86_400.0])
+def test_what_is_still_warm_goes_on(tmp_path: Path, later_s: float) -> None:
+    """Two sensors do not show how warm they are. Of a recording in two files the second begins as the first ended, and
+    the next day's begins cold."""
+    strong = WARMING | {"nT": [[0.0] * 3, [4.0, -3.0, 2.0], [0.0] * 3, [0.0] * 3], "tau_s": 250.0}
+    whole = survey_file(tmp_path, scenario(5, strong), "whole.h5")
+    first, second = (half(whole, second=part) for part in (False, True))
+    with h5py.File(whole) as file, h5py.File(second, "r+") as part:
+        n, added = len(file["time"]), file["truth/effect_00_warm_up"][()]
+        field = file["truth/total_field_true"][n // 2 :]
+        if later_s:
+            part["b_raw"][...] += added[: n - n // 2] - added[n // 2 :]
+        for name in ("time", "reference/time"):
+            part[name][...] += later_s
+    for path in (first, second):
+        of_two(path)
+    done = magtensor.close_loop(first, search=["warm_up"])
+    assert [a["error_model"] for a in done.verdict["adopted"]] == ["warm_up"]
+    b = done.calibration.apply(second)["calibrated/b"]
+    error = np.linalg.norm(b[:, 1], axis=1) - field
+    assert np.sqrt(np.mean(error[:240] ** 2)) < 0.18  # of noise 0.15 nT; taken wrongly it makes 1 nT

@@ -35,9 +35,9 @@ def noise_std(b: Array, total_field: Array | None = None) -> Array:
     if sensors == 1:
         assert total_field is not None
         along = np.linalg.norm(b[:, 0], axis=1) - total_field
-        return np.full((1, 3), _second_difference_std(along[:, None])[0])
+        return np.full((1, 3), second_difference_std(along[:, None])[0])
     contrasts = b - b.mean(axis=1, keepdims=True)
-    variance = _second_difference_std(contrasts.reshape(n, -1)).reshape(sensors, 3) ** 2
+    variance = second_difference_std(contrasts.reshape(n, -1)).reshape(sensors, 3) ** 2
     if sensors == 2:  # the two contrasts are one and the same
         share = np.full(2, 0.5) if total_field is None else shares_of_two(b, total_field)
         return np.sqrt(4.0 * variance * share[:, None])
@@ -74,8 +74,8 @@ def shares_of_two(b: Array, total_field: Array) -> Array:
         (2,) shares, of sum 1.
     """
     along = np.linalg.norm(b, axis=2) - total_field[:, None]
-    each = _second_difference_std(along) ** 2
-    sums = _second_difference_std(np.column_stack([along.sum(axis=1), along[:, 0] - along[:, 1]])) ** 2
+    each = second_difference_std(along) ** 2
+    sums = second_difference_std(np.column_stack([along.sum(axis=1), along[:, 0] - along[:, 1]])) ** 2
     own = each - max((sums[0] - sums[1]) / 4.0, 0.0)
     if not own.sum() > 0:
         return np.full(2, 0.5)
@@ -84,7 +84,7 @@ def shares_of_two(b: Array, total_field: Array) -> Array:
     return shares
 
 
-def _second_difference_std(series: Array) -> Array:
+def second_difference_std(series: Array) -> Array:
     """Robust standard deviation of white noise in each column of (N, K)."""
     second = np.diff(series, n=2, axis=0) / np.sqrt(6.0)
     robust = MAD_TO_SIGMA * np.median(np.abs(second - np.median(second, axis=0)), axis=0)

@@ -30,7 +30,7 @@ from .joint import JointFit, Posterior, nearest_frame
 from .joint_covariance import frame_projection
 from .joint_together import Found, Together, limits_of
 from .maximum_likelihood import NOTHING, ScalarFit, along
-from .noise import noise_std
+from .noise import noise_std, second_difference_std
 from .scalar import checked_samples
 from .types import Array, Mask
 
@@ -43,6 +43,7 @@ ROUNDING = 1e-13
 CLOSE = 0.01  # standard deviations of what is fitted: of the last step
 ASTRAY = 10.0  # the same: no step leads to a fit, as of outputs that an effect which ran away has been taken off
 LARGEST = 100.0  # of F: of outputs that an effect which ran away has been taken off
+LOUDEST = 3.0  # times what outputs differ by from sample to sample: more noise they hold in no calibration
 DIVERGES, HINT = "the fit near nominal does not converge", "look for disturbed samples"
 _ROUNDS = 8
 _STEPS = 20
@@ -186,7 +187,7 @@ def fit_nominal(
     noise, reference_noise, worst_error, keep, complete: as in `joint.fit_recording`. A complete model is also held
         against the prior.
     quiet_field: (N,) nT, the total field without the reference's own noise; the total field itself when None.
-    start: a fit of nearly the same outputs, to begin with; sensors at nominal when None.
+    start: a fit of nearly the same outputs, to begin with; sensors at nominal when None, and where it leads nowhere.
 
     Raises
     ------
@@ -210,6 +211,7 @@ def fit_nominal(
     rows = np.tile(np.eye(3, 4), (sensors, 1))
     if start is not None:
         rows = np.column_stack([start.forward.reshape(-1, 3), start.offset.ravel() / unit])
+    loudest = LOUDEST * _rms(np.maximum(second_difference_std(flat[believed]), QUIETEST * unit))
     own = _noise(rows, flat, total_field, unit, believed) if noise is None else np.asarray(noise).ravel()
     here, covariance, weights, step = None, np.zeros(0), (0.0, 0.0), 0.0
     for round_ in range(_ROUNDS):
@@ -227,10 +229,16 @@ def fit_nominal(
             now = _noise(rows, flat, total_field, unit, believed)
             settled = settled and bool(np.max(np.abs(np.log(now / own))) < 0.02)
             own = own if settled else now
-        if settled:
+        if settled or (noise is None and not _rms(own) <= loudest):
             break
     assert here is not None
-    if not step <= ASTRAY:  # nor where it is no number
+    astray = not step <= ASTRAY or (noise is None and not _rms(own) <= loudest)  # nor where it is no number
+    if astray and start is not None:
+        return fit_nominal(
+            raw, total_field, nominal, noise=noise, reference_noise=reference_noise, worst_error=worst_error, keep=keep,
+            complete=complete, quiet_field=quiet_field,
+        )  # fmt: skip
+    if astray:
         raise NotEnoughData(DIVERGES, hint=HINT)
     y = here.plane.coordinates(raw)
     seen = along(here.matrix, here.offset, y.T, total_field if quiet_field is None else quiet_field, 0.0)
@@ -250,6 +258,10 @@ def _noise(rows: Array, flat: Array, total_field: Array, unit: float, believed: 
     forward = rows[:, :3].reshape(-1, 3, 3)
     own = np.sqrt(np.einsum("sij,sj->si", forward**2, found)).ravel()
     return np.maximum(own, QUIETEST * unit)
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(values**2)))
 
 
 def _fields(rows: Array, flat: Array, unit: float) -> Array:

@@ -16,7 +16,7 @@ from magtensor.error_models.needs import FACTS
 from magtensor.error_models.settings import NOT_KNOWN, AnyChannel, Beginning, Duration, EventTimes, profiled
 from magtensor.error_models.waveform import NAME
 from magtensor.errors import DataError, UsageError
-from magtensor.loop.correcting.another_survey import LONG, TONE, as_dated_here, shows_a_state, unknown
+from magtensor.loop.correcting.another_survey import LONG, TONE, WARM_UP, as_dated_here, shows_a_state, unknown
 from magtensor.loop.correcting.beyond import seen_here
 from magtensor.loop.correcting.correction import corrected_raw, corrected_reference, hidden_objection
 from magtensor.loop.correcting.lengths import AVERAGING, averaged_otherwise, contradicted
@@ -60,7 +60,7 @@ def effect_variables(
         for a, t in zip(adopted, theta, strict=True)
     ]
     attributes = {"channel_origins": json.dumps({k: np.asarray(v).tolist() for k, v in origins.items()})}
-    attributes["start"] = started(survey).isoformat()
+    attributes["start"], attributes["end"] = started(survey).isoformat(), ended(survey).isoformat()
     attributes |= seen_here(record_of(survey, origins, use=believed), adopted)
     return {"calibration/effects": (("effect",), np.array(texts, dtype=np.str_), attributes)}
 
@@ -99,13 +99,17 @@ def on_its_clock(
     """Effects of a calibration as they are on another survey: what happened at a time has happened since then.
 
     A jump stays, and a drift holds its last value, unless the survey's own outputs show that it begins anew, happened
-    before or has not yet. Warming up begins with every survey, and what a lagged response began with is another
-    survey's own.
+    before or has not yet. Warming up begins with every survey, but goes on in one that follows sooner than the
+    electronics could cool, and what a lagged response began with is another survey's own.
     """
-    begun = calibration["calibration/effects"].attrs.get("start") if adopted else None
-    if begun is None:
+    facts = calibration["calibration/effects"].attrs if adopted else {}
+    if "start" not in facts:
         return list(adopted)
-    known = begun_with(adopted, datetime.fromisoformat(str(begun)), survey)
+    begun, end = (datetime.fromisoformat(str(facts[name])) if name in facts else None for name in ("start", "end"))
+    assert begun is not None
+    known = begun_with(adopted, begun, survey)
+    if end is not None:
+        known = [replace(a, start=_seconds(begun, survey)) if _still_warm(a, end, survey) else a for a in known]
     dated = [i for i, a in enumerate(known) if a.start is not None and a.component.effect == "instrument"]
     if not dated:
         return known
@@ -208,10 +212,21 @@ def contradicted_here(
 
 def begun_with(adopted: Sequence[Adopted], begun: datetime, survey: Survey) -> list[Adopted]:
     """Effects of a survey that began at some date, on the clock of another survey."""
-    seconds = (begun - started(survey)).total_seconds() + float(survey.time[0])
+    seconds = _seconds(begun, survey)
     if seconds != float(survey.time[0]) or shows_a_state(survey.values("b_raw"), "position" in survey):
         adopted = [_begun_unknown(a) for a in adopted]
     return [replace(a, start=seconds) if _of_a_time(a) else a for a in adopted]
+
+
+def _seconds(date: datetime, survey: Survey) -> float:
+    """A date on the clock of a survey, s."""
+    return (date - started(survey)).total_seconds() + float(survey.time[0])
+
+
+def _still_warm(model: Adopted, end: datetime, survey: Survey) -> bool:
+    """Whether a survey follows another one, which ended at some date, within the time constant of a warming up."""
+    after = (started(survey) - end).total_seconds()
+    return model.name == WARM_UP and 0.0 <= after < float(model.settings["tau_s"])
 
 
 def _begun_unknown(model: Adopted) -> Adopted:
@@ -230,6 +245,11 @@ def started(survey: Survey) -> datetime:
     parts = split_since(str(survey["time"].attrs["units"]))
     assert parts is not None
     return parts[1] + timedelta(seconds=float(survey.time[0]))
+
+
+def ended(survey: Survey) -> datetime:
+    """The date of a survey's last sample."""
+    return started(survey) + timedelta(seconds=float(survey.time[-1] - survey.time[0]))
 
 
 def cleaned(
