@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from loop_cases import Array, adopted_names, linear_state, scenario, synthetic, verdict_of
 
+from magtensor.loop.evidence.assessment import estimated
+from magtensor.loop.evidence.statistics import Estimate
 from magtensor.loop.fitting.model import Record
+from magtensor.loop.searching import larger_law
 from magtensor.loop.searching.gates import ALPHA
 from magtensor.loop.searching.larger_law import part_of_a_larger_law
 from magtensor.loop.searching.screening import candidates_of
@@ -56,6 +60,19 @@ def test_a_small_part_of_what_follows_the_attitude_is_none(name: str, kink_nT: f
     (candidate,) = candidates_of(state, [REGISTRY.find("error_model", name)], {}, ALPHA)
     assert candidate.significant or refused
     assert ("so does what it leaves" in part_of_a_larger_law(candidate, state)) is refused
+
+
+def test_what_explains_nothing_leaves_no_law_where_nothing_stays(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In noise of another colour the best coefficients may add to the sum of squares, and noise is no law."""
+    state = linear_state(synthetic(5, SAMPLES))
+    (candidate,) = candidates_of(state, [REGISTRY.find("error_model", "cross_field")], {}, ALPHA)
+
+    def too_large(*given: Any) -> Estimate:
+        found = estimated(*given)
+        return replace(found, theta=3.0 * found.theta)
+
+    monkeypatch.setattr(larger_law, "estimated", too_large)
+    assert part_of_a_larger_law(candidate, state) == ""
 
 
 @pytest.mark.long

@@ -38,7 +38,7 @@ def part_of_a_larger_law(candidate: Candidate, state: State) -> str:
     assert residual.across is not None and left.across is not None
     explained = float(np.sum(residual.across**2) - np.sum(left.across**2))
     stays = attitude_square(before, left)
-    if explained >= SMALL * stays:
+    if stays <= 0.0 or explained >= SMALL * stays:
         return ""
     ratio = np.sqrt(max(explained, 0.0) / stays)
     return f"it follows the attitude, and so does what it leaves, of which it is {ratio:.0%}"
