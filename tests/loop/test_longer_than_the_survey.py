@@ -5,11 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from loop_cases import linear_state, synthetic
 
 from magtensor.error_models import first_order
+from magtensor.loop.searching import rivals
 from magtensor.loop.searching.gates import ALPHA
-from magtensor.loop.searching.rivals import hardly_begun, simplest
+from magtensor.loop.searching.rivals import hardly_begun, simplest, still_settling
 from magtensor.loop.searching.rounds import with_lines
 from magtensor.loop.searching.screening import candidates_of
 from magtensor.registry import Registry
@@ -41,3 +43,23 @@ def test_what_follows_another_channel_at_once_comes_first() -> None:
     for best in (named, generic):
         chosen, others = simplest(best, [named, generic], state)
         assert chosen is generic and others == ("temperature_scale",)
+
+
+@pytest.mark.parametrize(("share", "drift"), [(0.8, True), (0.2, False)])
+def test_what_settles_as_slowly_as_the_survey_lasts_is_a_drift(
+    share: float, drift: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where nothing separates the two: applied elsewhere a warming up begins anew, and a drift goes on."""
+    elapsed = np.arange(SAMPLES, dtype=float)
+    added = 0.6 * np.exp(-elapsed / (share * SAMPLES))[:, None, None] * np.random.default_rng(4).standard_normal((4, 3))
+    record = synthetic(6, SAMPLES, noise_nT=0.3, turning_s=4.0, added=added)
+    state = with_lines(linear_state(record), record)
+    registry = Registry.load()
+    models = [registry.find("error_model", name) for name in ("warm_up", "offset_drift")]
+    found = candidates_of(state, models, {}, ALPHA)
+    settling = next(c for c in found if c.model.name == "warm_up")
+    assert all(c.passes for c in found) and still_settling(settling.model, state.excitation) is drift
+    monkeypatch.setattr(rivals, "separated", lambda *_: False)
+    chosen, others = simplest(settling, found, state)
+    assert {chosen.model.name, *others} == {"warm_up", "offset_drift"}
+    assert chosen.model.name == ("offset_drift" if drift else "warm_up")

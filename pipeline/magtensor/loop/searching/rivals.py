@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from magtensor.error_models.excitation import Excitation
-from magtensor.error_models.settings import AnyChannel, profiled
+from magtensor.error_models.settings import AnyChannel, Duration, EventTimes, Range, profiled
 from magtensor.error_models.terms import joined
 from magtensor.loop.evidence.assessment import estimated, explained
 from magtensor.loop.fitting.model import Adopted, State, generic
@@ -29,8 +29,9 @@ def simplest(best: Candidate, possible: Sequence[Candidate], state: State) -> tu
 
     Simplest is more of what was adopted already, with another setting; then what has the fewest coefficients, what it
     began with among them, and of those what lasts. A response that no model names comes after these, and one that lags
-    by half the survey or longer after all: a channel seen through such a lag is whatever it should be. A model that
-    slow noise could explain is named, and not chosen before one that it could not.
+    by half the survey or longer after all: a channel seen through such a lag is whatever it should be, and what settles
+    as slowly is a drift, but would begin anew with every survey. A model that slow noise could explain is named, and
+    not chosen before one that it could not.
     """
     colours = best.assessment.colours
     parts = best.assessment.parts
@@ -50,7 +51,8 @@ def simplest(best: Candidate, possible: Sequence[Candidate], state: State) -> tu
     known = {a.name for a in state.adopted}
 
     def complexity(c: Candidate) -> tuple[bool, bool, bool, int, bool, float]:
-        slow, new, once = hardly_begun(c.model, state.excitation), c.model.name not in known, happens_once(c.model)
+        slow = hardly_begun(c.model, state.excitation) or still_settling(c.model, state.excitation)
+        new, once = c.model.name not in known, happens_once(c.model)
         return slow, generic(c.model), new, c.assessment.estimate.rank + begun(c), once, -c.assessment.gain.total
 
     chosen = min((c for c in equal if c is best or c.passes), key=complexity)
@@ -186,6 +188,15 @@ def hardly_begun(model: Adopted, x: Excitation) -> bool:
     through such a lag can be any drift."""
     found = beginning(model.component, model.settings)
     return found is not None and float(model.settings[found[1].lag]) > SLOW * x.duration
+
+
+def still_settling(model: Adopted, x: Excitation) -> bool:
+    """Whether what began with the survey settles with half of it or longer: it is a drift as much."""
+    marks = profiled(model.component)
+    if any(isinstance(mark, (Duration, EventTimes)) for mark in marks.values()):
+        return False
+    of_time = [name for name, mark in marks.items() if isinstance(mark, Range) and mark.of_duration]
+    return any(float(model.settings[name]) > SLOW * x.duration for name in of_time)
 
 
 def _channel(candidate: Candidate) -> str:
