@@ -34,7 +34,7 @@ def _more_than_noise(_: Excitation, __: Mapping[str, Any], coefficients: Array, 
 
 @error_model(
     "reference",
-    needs=("total_field",),
+    needs=("base_station",),
     agrees=_more_than_noise,
     source="spatial change of the diurnal variation",
     typical="0.1 to 1 nT; some per cent of the variation over tens of km or beside a coast",
@@ -66,7 +66,7 @@ def _about_its_delay(settings: Mapping[str, Any], coefficients: Array) -> dict[s
 
 @error_model(
     "reference",
-    needs=("total_field",),
+    needs=("base_station",),
     agrees=_delayed_by_its_lag,
     about=_about_its_delay,
     source="shift in time",
@@ -94,7 +94,7 @@ def reference_clock(
 
 @error_model(
     "reference",
-    needs=("total_field",),
+    needs=("base_station",),
     source="drift of the base station",
     typical="below 1 nT a day for a proton magnetometer, some nT in an hour where its place or its sensor warms up",
     pointwise=True,
@@ -112,7 +112,11 @@ def reference_drift(x: Excitation, *, order: Order = 1, span_s: Span = 3600.0, l
 
 
 @error_model(
-    "reference", needs=("total_field",), source="shift in level", typical="any: the station's new place", pointwise=True
+    "reference",
+    needs=("base_station",),
+    source="shift in level",
+    typical="any: the station's new place",
+    pointwise=True,
 )
 def reference_step(x: Excitation, *, time_s: EventTime = 0.0) -> Terms:
     """The base station was moved or retuned: its total field jumps at a time.

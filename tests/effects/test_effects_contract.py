@@ -66,10 +66,10 @@ NEEDED = {
     "position_error": ["position", "gradient"],
     "finite_baseline": ["position", "travel"],
     "baseline_expansion": ["position", "gradient", "temperature*"],
-    "reference_scale": ["total_field"],
-    "reference_clock": ["total_field"],
-    "reference_drift": ["total_field"],
-    "reference_step": ["total_field"],
+    "reference_scale": ["base_station"],
+    "reference_clock": ["base_station"],
+    "reference_drift": ["base_station"],
+    "reference_step": ["base_station"],
     "latent_source": ["waveform"],
     "sampling_lag": ["rotation"],
     "eddy_current": ["rotation"],
@@ -97,6 +97,16 @@ def test_what_a_bare_survey_lacks_is_named(name: str) -> None:
     if not lacks and name != "channel_response":
         terms = component.function(bare)
         assert np.isfinite(terms.series).all()
+
+
+def test_a_constant_is_no_base_station() -> None:
+    """Nor is what interpolation makes of one."""
+    component = components()["reference_step"]
+    x = example_survey(component)
+    assert x.total_field is not None and missing(component, x) == []
+    constant = np.full_like(x.total_field, 44_400.0) + 1e-9 * np.arange(len(x.time))
+    assert missing(component, replace(x, total_field=constant)) == ["base_station"]
+    assert missing(components()["averaging"], replace(x, total_field=constant)) == []
 
 
 def test_a_thermometer_is_known_by_its_units_too() -> None:

@@ -1,8 +1,9 @@
 """Whether a survey has what an error model needs.
 
 A need is the name of a channel (`acceleration`, `current_*`), a fact of the survey (`attitude`, `position`,
-`total_field`, `rotation`, `gradient`, `travel`, `waveform`), or several of these of which one will do
-(`acceleration|attitude`). A gradient is that of the field which an array travels through, or of the calibration site,
+`total_field`, `base_station`, `rotation`, `gradient`, `travel`, `waveform`), or several of these of which one will do
+(`acceleration|attitude`). A base station has a total field that was measured: a constant has none, and errs in no way
+that a station does. A gradient is that of the field which an array travels through, or of the calibration site,
 known once an error model of the site is adopted.
 """
 
@@ -10,14 +11,26 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import numpy as np
+
+from magtensor.calibration.types import Array
 from magtensor.components import Component
 from magtensor.error_models.excitation import Excitation
 from magtensor.error_models.settings import AnyChannel
+
+CONSTANT = 1e-9  # of the total field: what interpolation makes of one
+
+
+def measured(total_field: Array) -> bool:
+    """Whether a total field (N,) nT is more than a constant."""
+    return bool(np.ptp(total_field) >= CONSTANT * np.mean(total_field))
+
 
 FACTS: dict[str, Callable[[Excitation], bool]] = {
     "attitude": lambda x: x.attitude is not None,
     "position": lambda x: x.position is not None,
     "total_field": lambda x: x.total_field is not None,
+    "base_station": lambda x: x.total_field is not None and measured(x.total_field),
     "rotation": lambda x: x.turns,
     "gradient": lambda x: x.site is not None or not x.uniform,
     "travel": lambda x: not x.uniform,
@@ -26,6 +39,7 @@ FACTS: dict[str, Callable[[Excitation], bool]] = {
 
 
 IN_WORDS = {
+    "base_station": "a total field that was measured, and is no mere constant",
     "rotation": "a field that turns, so slowly between samples that its rate of change is known",
     "gradient": "a field that differs between the sensors",
     "travel": "a field that changes along the way",

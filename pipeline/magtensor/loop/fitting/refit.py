@@ -17,6 +17,7 @@ from magtensor.calibration.recording import InMemory
 from magtensor.calibration.types import Array
 from magtensor.error_models.delays import cleared
 from magtensor.error_models.excitation import Excitation
+from magtensor.error_models.needs import measured
 from magtensor.error_models.terms import Terms, joined
 from magtensor.errors import DataError, NotEnoughData
 from magtensor.loop.evidence.assessment import WHITE, Colours, colours_of, estimated, log_likelihood
@@ -28,7 +29,6 @@ from magtensor.loop.fitting.seen import beside_the_site, excitation_of
 
 MOST_ROUNDS = 6
 _SLACK = 4.0  # in the error accepted while an effect may yet turn out to cause most of it
-CONSTANT = 1e-9  # of the total field: what interpolation makes of one
 SETTLED = 0.02  # of a standard deviation
 HARDLY_SHOWN = 1e3  # times the variance that a coefficient would have alone
 SHOWN = 3.0  # standard deviations
@@ -157,7 +157,7 @@ def require_more_than_a_constant(record: Record, how: Fitting) -> None:
     field = record.total_field
     if how.nominal is None or field is None or record.raw.shape[1] > 1:
         return
-    if np.ptp(field) < CONSTANT * np.mean(field):
+    if not measured(field):
         raise NotEnoughData(
             "one sensor beside a total field that is a constant: what the sensor adds cannot be told from the field",
             hint="a measured total field, a second sensor, or attitudes all round would tell",
