@@ -9,6 +9,7 @@ import numpy as np
 from pydantic import Field
 
 from magtensor import ErrorModelsChoice, stage
+from magtensor.errors import NotEnoughData
 from magtensor.survey.flags import flag_ranges
 from magtensor_stages.sensors import COMMON, common_frame
 
@@ -95,7 +96,10 @@ def close_loop(
 
     nominal = None if undetermined == "refuse" else Nominal(nominal_scale, nominal_angle_deg, nominal_offset)
     if inquiry is None:
-        inquiry, found, refused = settled(inquired, Fitting(reference_noise_nT, worst_error), nominal)
+        try:
+            inquiry, found, refused = settled(inquired, Fitting(reference_noise_nT, worst_error), nominal)
+        except NotEnoughData as error:
+            raise _or_by_directions(error, survey) from error
     else:
         made = inquiry
         inquiry, found, refused = settled(lambda _: made, made.how, None)
@@ -151,3 +155,11 @@ def close_loop(
             *flag_ranges(survey.time, late, by="close_loop", reason=LATE),
         ]
     return given
+
+
+def _or_by_directions(error: NotEnoughData, survey: Survey) -> NotEnoughData:
+    """A refusal that names what an attitude is good for, where a single sensor has one."""
+    if len(survey.sensors) > 1 or "attitude" not in survey:
+        return error
+    also = "the survey has an attitude: `calibrate_vector` in the place of close_loop calibrates by known directions"
+    return type(error)(error.what, where=error.where, hint="; ".join(h for h in (error.hint, also) if h))

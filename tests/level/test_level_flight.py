@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 from level_cases import flight, written
 
@@ -72,4 +73,10 @@ def test_one_sensor_alone_needs_a_measured_total_field(tmp_path: Path, capsys: A
     assert (
         status_of(["run", str(RECIPES / "closed_loop.yaml"), "--input", constant, "--output", str(tmp_path / "b")]) == 3
     )
-    assert "what the sensor adds cannot be told from the field" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "what the sensor adds cannot be told from the field" in said and "calibrate_vector" not in said
+    with h5py.File(constant, "r+") as file:
+        file["attitude"] = np.tile([0.0, 0.0, 0.0, 1.0], (len(file["time"]), 1))
+        file["attitude"].attrs["units"] = "1"
+    assert status_of(["run", str(RECIPES / "closed_loop.yaml"), "--input", constant, "--output", str(tmp_path / "c")])
+    assert "`calibrate_vector` in the place of close_loop" in capsys.readouterr().err

@@ -141,7 +141,7 @@ class Coverage:
         """The attitudes that are missing, in words; empty where the directions are well spread."""
         words = []
         if self.still:
-            words.append(f"the {' and '.join(self.still)} output never changed")
+            words.append(f"the {' and '.join(self.still)} output never changed by 0.1 % of the field")
         if self.unseen:
             words.append(f"the field never came within {UNSEEN:.0f} deg of the sensor's {', '.join(self.unseen)}")
         if self.empty_cones:
