@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtensor.calibration.joint import JointFit
-from magtensor.calibration.nominal import least
+from magtensor.calibration.nominal_steps import least
 from magtensor.calibration.types import Array
 from magtensor.error_models.terms import Terms
 from magtensor.loop.evidence.turned import SlowModes
