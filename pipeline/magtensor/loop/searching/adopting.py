@@ -111,7 +111,9 @@ def _sufficient(state: State, which: int) -> tuple[str, ...] | None:
     """The one sensor whose coefficients explain all that a model does, where others can stand in for them.
 
     If only differences between sensors are seen, or little else, one that turned is like all others turned the other
-    way: every coefficient is significant, or none is. None where no sensor suffices, or several do.
+    way: every coefficient is significant, or none is. None where no sensor suffices, or several do. What is not seen of
+    several sensors is shared out among them, and wrong on each: where there is such a part, one alone may lose as much
+    as does not tell two models apart.
     """
     from scipy.special import chdtri
 
@@ -120,7 +122,10 @@ def _sufficient(state: State, which: int) -> tuple[str, ...] | None:
     found = []
     for sensor in sorted(set(owners) - {""}):
         gone, seen, lost = _without_others(state, which, (sensor,))
-        if not seen or lost >= float(chdtri(seen, KEEP_ALPHA)):
+        if not seen:
+            continue
+        least = float(chdtri(seen, KEEP_ALPHA))
+        if lost >= (max(least, SEPARATION + seen) if seen < gone else least):
             continue
         if seen < gone or _spare(state, which, (sensor,)):
             found.append(sensor)
