@@ -21,7 +21,7 @@ MOST_NEAREST = 5
 
 @dataclass(frozen=True)
 class Suspects:
-    """What the candidates of the last round say of what is left: names of models.
+    """What the candidates of the last round say of what is left: names of models; "another" one is adopted already.
 
     Attributes:
         open: those that pass the first two gates and were refused, with the reason; useless: significant ones that do
@@ -58,11 +58,16 @@ class Suspects:
             c for c in seen
             if c.model.name not in noisy and not (c.of_the_log or c.of_second_order or c.of_the_law)
         ]  # fmt: skip
+        adopted = {a.name for a in found.last.adopted}
+
+        def named(name: str) -> str:
+            return f"another {name}" if name in adopted else name
+
         open_ = [c.model.name for c in suspects if c.passes]
         near = sorted((c for c in last if c.adjusted_p < NEAR), key=lambda c: c.adjusted_p)
         return cls(
-            [f"{name} ({refused[name]})" if name in refused else name for name in open_],
-            [c.model.name for c in suspects if not c.passes],
+            [f"{named(name)} ({refused[name]})" if name in refused else named(name) for name in open_],
+            [named(c.model.name) for c in suspects if not c.passes],
             [c.model.name for c in seen if c.model.name not in noisy and c.of_second_order],
             [c.model.name for c in seen if c.model.name in noisy],
             [c.model.name for c in near if sparse is None or c.model.name not in noisy][:MOST_NEAREST],
