@@ -10,7 +10,7 @@ acts on. The stages are those of `recipes/closed_loop.yaml`. What is adopted of 
 of this study; it is compared with that:
 
 - **right**: the effect, or a rival that names it, is adopted, on the right sensors; **rival**: named as
-  indistinguishable from what is adopted; **told**: not adopted, but what is left looks like it, or is more than without
+  indistinguishable from what is adopted; **wrong**: something else is adopted in its place; **told**: not adopted, but what is left looks like it, or is more than without
   it; **missed**: neither.
 - **beside it**: adopted, though neither put in nor adopted without it.
 - **off by**: the coefficients against those put in, as a share of these, where it is adopted under its own name.
@@ -54,12 +54,13 @@ EFFECTS = {
     QUADCOPTER: ("temperature_offset", "offset_step", "offset_while", "current_field", "latent_source"),
     CONRAD: ("offset_step", "offset_while", "current_field", "latent_source"),
 }  # fmt: skip
-AMPLITUDES = (1.0, 3.0, 10.0)
+AMPLITUDES = (3.0, 10.0)
 LATE_S, LOADED_A, HOLD_S = 60.0, 1.5, 40.0
 FULL_SCALE_NT = 50_000.0
 HALF = 0.5  # of coefficients, by which they may be off where the recording has some of that name itself
 MORE = 1.1  # times what is left without the effect
 SEED = 20
+OUTCOMES = ("right", "rival", "wrong", "told", "missed")
 
 
 class Trial(NamedTuple):
@@ -223,6 +224,8 @@ def judged(effect: str, names: list[str], put: Put, before: dict[str, Any], now:
         outcome = "right"
     elif acts:
         outcome = "rival"
+    elif others:
+        outcome = "wrong"
     elif effect in (now["unexplained"].get("looks_like") or []) or left(now) > MORE * left(before):
         outcome = "told"
     else:
@@ -274,12 +277,12 @@ def table(rows: list[dict[str, Any]]) -> str:
 def totals(rows: list[dict[str, Any]]) -> str:
     """How often each outcome came, amplitude by amplitude."""
     made = [r for r in rows if r["effect"] and "refused" not in r]
-    head = ["size over the noise floor", "trials", "right", "rival", "told", "missed", "something else beside it"]
+    head = ["size over the noise floor", "trials", *OUTCOMES, "something else beside it"]
     lines = [head, ["---"] * len(head)]
     for size in sorted({r["amplitude"] for r in made}):
         mine = [r for r in made if r["amplitude"] == size]
         counts: list[Callable[[dict[str, Any]], bool]] = [
-            *(lambda r, w=word: r["outcome"] == w for word in ("right", "rival", "told", "missed")),
+            *(lambda r, w=word: r["outcome"] == w for word in OUTCOMES),
             lambda r: bool(r["beside"]),
         ]
         lines.append([f"{size:g} x", str(len(mine)), *(str(sum(map(c, mine))) for c in counts)])
