@@ -9,9 +9,9 @@ sensor. Its size is a multiple of the noise floor that the loop finds without it
 acts on. The stages are those of `recipes/closed_loop.yaml`. What is adopted of the part as it was measured is no claim
 of this study; it is compared with that:
 
-- **right**: the effect, or a rival that names it, is adopted, on the right sensors; **rival**: named as
-  indistinguishable from what is adopted; **wrong**: something else is adopted in its place; **told**: not adopted, but what is left looks like it, or is more than without
-  it; **missed**: neither.
+- **right**: the effect is adopted, on the right sensors, under its name or as a response to its channel; **rival**: it
+  is named as indistinguishable from what is adopted; **wrong**: something else is adopted in its place; **told**:
+  nothing is, but what is left looks like it, or is more than without it; **missed**: none of these.
 - **beside it**: adopted, though neither put in nor adopted without it.
 - **off by**: the coefficients against those put in, as a share of these, where it is adopted under its own name.
 
