@@ -20,7 +20,6 @@ The recordings are not part of the project (docs/measured/README.md). No number 
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import tempfile
@@ -289,28 +288,19 @@ def totals(rows: list[dict[str, Any]]) -> str:
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
-def page(rows: list[dict[str, Any]]) -> str:
-    """The study's page."""
-    assert __doc__ is not None
-    return f"# An effect put into measured recordings\n\n{__doc__.strip()}\n\n{totals(rows)}\n\n{table(rows)}\n"
+def trial_of(row: dict[str, Any]) -> Trial:
+    """The trial that a row is of."""
+    return Trial(Part(*row["part"]), row["effect"], row["amplitude"])
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    trials.add_options(parser)
-    parser.add_argument("--page", type=Path)
-    parser.add_argument("--only", default="", help="recordings whose name holds this")
-    given = parser.parse_args()
-    wanted = [t for t in planned_trials() if given.only in t.part.recipe]
+    def planned(only: str) -> list[Trial]:
+        return [trial for trial in planned_trials() if only in trial.part.recipe]
 
-    def trial_of(row: dict[str, Any]) -> tuple[Any, ...]:
-        return Trial(Part(*row["part"]), row["effect"], row["amplitude"])
-
-    rows, _ = trials.rows_of(given, wanted, trial_of, tried, lambda row: " | ".join(words(row)))
-    if given.page:
-        given.page.write_text(page(rows), encoding="utf-8")
-    print(totals(rows))
-    print(table(rows))
+    title = "An effect put into measured recordings"
+    trials.of_recordings(
+        title, __doc__, planned, trial_of, tried, words, lambda rows: f"{totals(rows)}\n\n{table(rows)}"
+    )
 
 
 if __name__ == "__main__":

@@ -90,6 +90,34 @@ def study(
         chosen.page.write_text(page(command, rows, open_))
 
 
+def of_recordings(
+    title: str,
+    words: str | None,
+    planned: Callable[[str], Iterable[tuple[Any, ...]]],
+    trial_of: Callable[[Row], Sequence[Any]],
+    tried: Callable[[Any], Row],
+    cells: Callable[[Row], Sequence[str]],
+    tables: Callable[[list[Row]], str],
+) -> None:
+    """The command line of a study of measured recordings: run what is missing, print its tables and write the page.
+
+    Parameters
+    ----------
+    words: its help, which is the page's too.
+    planned: the trials of recordings whose name holds a word; trial_of, tried: as in `rows_of`.
+    cells: of a row, printed when it is new; tables: of all rows.
+    """
+    parser = argparse.ArgumentParser(description=words, formatter_class=argparse.RawDescriptionHelpFormatter)
+    add_options(parser)
+    parser.add_argument("--page", type=Path, help="write the tables here")
+    parser.add_argument("--only", default="", help="recordings whose name holds this")
+    chosen = parser.parse_args()
+    rows, _ = rows_of(chosen, planned(chosen.only), trial_of, tried, lambda row: " | ".join(cells(row)))
+    if chosen.page:
+        chosen.page.write_text(f"# {title}\n\n{(words or '').strip()}\n\n{tables(rows)}\n", encoding="utf-8")
+    print(tables(rows))
+
+
 def named(kind: Any) -> Callable[[Row], Any]:
     """Reads a trial, a named tuple of that kind, out of a row that holds its fields among others."""
     return lambda row: kind(*(row[field] for field in kind._fields))

@@ -15,7 +15,6 @@ field, of which they are no test.
 
 from __future__ import annotations
 
-import argparse
 import copy
 import json
 import tempfile
@@ -153,23 +152,12 @@ def table(rows: list[dict[str, Any]]) -> str:
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
-def page(rows: list[dict[str, Any]]) -> str:
-    """The study's page."""
-    assert __doc__ is not None
-    return f"# Parts of the measured recordings\n\n{__doc__.strip()}\n\n{table(rows)}\n"
-
-
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    trials.add_options(parser)
-    parser.add_argument("--page", type=Path)
-    parser.add_argument("--only", default="", help="recordings whose name holds this")
-    given = parser.parse_args()
-    wanted = [p for p in parts() if given.only in p.recipe]
-    rows, _ = trials.rows_of(given, wanted, lambda row: row["part"], tried, lambda row: " | ".join(words(row)))
-    if given.page:
-        given.page.write_text(page(rows), encoding="utf-8")
-    print(table(rows))
+    def planned(only: str) -> list[Part]:
+        return [part for part in parts() if only in part.recipe]
+
+    title = "Parts of the measured recordings"
+    trials.of_recordings(title, __doc__, planned, lambda row: row["part"], tried, words, table)
 
 
 if __name__ == "__main__":
