@@ -57,7 +57,8 @@ def test_the_effect_of_a_quiet_sensor_is_found_and_measured(tmp_path: Path) -> N
     assert adopted["sensors"] == ["S1"]
     looked = [step for step in found.steps if step["adopted"] is not None]
     assert looked[-1]["among"] == ["S1", "S2", "S4"]
-    assert not found.verdict["unexplained"]["present"]
+    left = found.verdict["unexplained"]["description"]
+    assert "mostly on S3" in left and "follows nothing that is logged" in left
     page = found.save(tmp_path / "out").directory / "report.html"
     assert "S1, S2, S4 looked at by themselves" in page.read_text()
     before = slow_difference(magtensor.close_loop(path, search=[]).dataset)

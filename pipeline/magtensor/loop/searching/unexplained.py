@@ -43,6 +43,7 @@ ALPHA = 0.001  # of each of the tests
 OF_A_LINE = 0.1  # of the square of what is left above the noise: less than that says nothing of its cause
 MUCH = 3.0  # times the white noise of an output: no base station beside a site differs by so much unnoticed
 TWICE = 2.0  # what the slow noise of the sensors, known from few frequencies, makes of it
+NO_NOISE = 5.0  # times the white noise: of noise whose power goes with 1/f the slow part has three at most
 MANY_FLAGGED = 0.01  # of the samples: of what is left, some is in these
 LOUD = 2.0  # times the usual noise
 PARTS = 10  # of a survey, that are compared
@@ -59,6 +60,12 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
     flagged = lasting(bad, beyond_the_reference(state, record)) | starts
     suspects = Suspects.of(found, flagged, sparse)
     words = [*_what_shows(found, record, excess, sparse), *suspects.words]
+    times = excess / state.residual.scale
+    if not words and times > NO_NOISE:
+        words.append(
+            f"it is slow, and {times:.2g} times the white noise, where noise with a power of 1/f has three at most: "
+            "what moved there follows nothing that is logged"
+        )
     beside = [*loud_words(state, record, found.how), *unread_words(state, record)]
     gradient = gradient_share(state, record.position)
     shaped = bool(words) and gradient > 0
