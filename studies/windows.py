@@ -7,10 +7,11 @@ nothing else declared or left out. No number was set on them, but what the ballo
 (the noise of rates of change, parts of what failed, events that a drift predicts), of which its rows are no test. Parts
 of a recording should tell the same: what one of them adopts and no other bears out is either weak there or an
 accusation. The recordings are not part of the project (docs/measured/README.md). Parts that are not in the table were
-not waited for. The fit with sensors near nominal has changed: the parts of Boulder, whose fits used to end anywhere
-(held-out errors of thousands of nT), are refused since. Of the others near nominal only the first two parts of the
-quadcopter were made again. The two of BROAD with a magnet, 32 and 34, led to the search for an event as strong as the
-field, of which they are no test.
+not waited for. The fit with sensors near nominal has changed: the first three weeks of Boulder and the first hours of
+Conrad were made again with it, and before that the first two parts of the quadcopter; the other parts near nominal, and
+the last week and the whole month of Boulder, which were refused, were not. The balloon's three parts of twenty minutes
+were made again too. The two of BROAD with a magnet, 32 and 34, led to the search for an event as strong as the field, of
+which they are no test.
 """
 
 from __future__ import annotations
