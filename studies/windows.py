@@ -10,8 +10,8 @@ accusation. The recordings are not part of the project (docs/measured/README.md)
 not waited for. The fit with sensors near nominal has changed: the first three weeks of Boulder and the first hours of
 Conrad were made again with it, and before that the first two parts of the quadcopter; the other parts near nominal, and
 the last week and the whole month of Boulder, which were refused, were not. The balloon's three parts of twenty minutes
-were made again too. The two of BROAD with a magnet, 32 and 34, led to the search for an event as strong as the field, of
-which they are no test.
+were made again too. The two of BROAD with a magnet, 32 and 34, led to the search for an event as strong as the field,
+of which they are no test.
 """
 
 from __future__ import annotations
