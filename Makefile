@@ -3,6 +3,8 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+# as many workers as cores, one thread each; the tests of a file share what they have made
+PYTEST := OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n auto --dist loadfile
 
 .PHONY: demo test test-long lint papers bench clean
 
@@ -24,10 +26,10 @@ lint: $(STAMP)
 	$(BIN)/lint-imports
 
 test: lint
-	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n auto  # as many workers as cores, one thread each
+	$(PYTEST)
 
 test-long: $(STAMP)
-	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n auto -m long  # those that `make test` leaves out
+	$(PYTEST) -m long  # those that `make test` leaves out
 
 bench: $(STAMP)
 	$(BIN)/python benchmarks/pipeline.py

@@ -90,7 +90,9 @@ def test_killed_batch_goes_on_where_it_stopped(blocked, archive):
     assert not list(archive.output.rglob(".partial-*"))
 
 
-@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize(
+    ("number", "status"), [(signal.SIGINT, 130), pytest.param(signal.SIGTERM, 143, marks=pytest.mark.long)]
+)
 def test_stopped_batch_ends_its_workers_and_goes_on(blocked, archive, number, status):
     until(lambda: list(states(archive).values()).count("done") == 2, "two records")
     blocked.process.send_signal(number)

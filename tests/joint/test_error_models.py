@@ -72,7 +72,7 @@ def error_of(found: WithCoefficients, survey: Drawn, theta: Array) -> Array:
     return np.concatenate([own, found.values - theta])
 
 
-@pytest.mark.parametrize(("sensors", "count"), [(4, 600), (1, 800)])
+@pytest.mark.parametrize(("sensors", "count"), [(4, 600), pytest.param(1, 800, marks=pytest.mark.long)])
 def test_joint_covariance_is_that_of_the_errors(sensors: int, count: int) -> None:
     pooled, squares = [], []
     for seed in range(40):

@@ -70,6 +70,7 @@ def test_covariance_is_that_of_the_errors(sensors: int, tilt_deg: float | None, 
     assert np.mean(squares) == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / (60 * (12 * sensors - 3))) + 0.02)
 
 
+@pytest.mark.long
 def test_coverage_of_all_kinds_of_survey_together() -> None:
     inside = []
     for seed in range(40):

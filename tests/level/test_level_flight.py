@@ -8,6 +8,7 @@ from typing import Any
 
 import h5py
 import numpy as np
+import pytest
 from level_cases import flight, written
 
 from magtensor.cli import status_of
@@ -23,6 +24,7 @@ def closed(folder: Path, survey: Path, *more: str) -> dict[str, Any]:
     return found
 
 
+@pytest.mark.long
 def test_the_current_is_found_and_the_calibration_is_not_claimed(tmp_path: Path, capsys: Any) -> None:
     effect = np.array([60.0, -25.0, 40.0])
     found = closed(tmp_path, written(tmp_path / "flight.h5", flight(11, tilt_deg=0.7, effect=effect)))

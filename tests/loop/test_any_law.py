@@ -77,6 +77,7 @@ def test_a_law_that_is_no_power_is_found_and_nothing_beside_it(law: str) -> None
     assert last.residual.square() < 1.1
 
 
+@pytest.mark.long
 def test_a_dead_zone_ends_where_it_does() -> None:
     """A bend at each of its edges."""
     values = course(6)

@@ -16,7 +16,13 @@ SEARCHED = ["latent_source", "passing_source", "offset_step"]
 
 @pytest.mark.parametrize(
     ("first", "count", "told"),
-    [(0, 1, False), (-1, 1, False), (-2, 2, False), (0, 10, True), pytest.param(1200, 3, True, marks=pytest.mark.long)],
+    [
+        (0, 1, False),
+        (-1, 1, False),
+        pytest.param(-2, 2, False, marks=pytest.mark.long),
+        (0, 10, True),
+        pytest.param(1200, 3, True, marks=pytest.mark.long),
+    ],
 )
 def test_they_are_flagged(tmp_path: Path, first: int, count: int, told: bool) -> None:
     path = survey_file(tmp_path, scenario(3))

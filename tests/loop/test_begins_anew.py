@@ -81,7 +81,7 @@ def test_a_drift_that_goes_on_does_not_begin_anew(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("effect", [DRIFT, STEP], ids=lambda e: str(e["type"]))
-@pytest.mark.parametrize("seed", [6, 7])
+@pytest.mark.parametrize("seed", [6, pytest.param(7, marks=pytest.mark.long)])
 def test_what_stays_does_not_begin_anew(tmp_path: Path, found: Found, effect: dict[str, Any], seed: int) -> None:
     """On the other day the offsets are what they were at the end of the first, and a little besides."""
     done, first = found(effect)
@@ -119,7 +119,7 @@ def test_a_slip_goes_on_where_the_outputs_show_it(tmp_path: Path, found: Found, 
     assert np.sqrt(np.mean(apart**2)) < 0.25  # of noise 0.17 nT; the slip makes some 150 nT
 
 
-@pytest.mark.parametrize("switched_on_s", [-1e5, -110.0, 0.0])
+@pytest.mark.parametrize("switched_on_s", [pytest.param(-1e5, marks=pytest.mark.long), -110.0, 0.0])
 def test_what_was_switched_on_before_is_warm(tmp_path: Path, found: Found, switched_on_s: float) -> None:
     done, _ = found(WARMING)
     before = WARMING | {"switched_on_s": switched_on_s}
@@ -159,7 +159,7 @@ def of_two(path: Path) -> None:
             file[name].attrs.update(attributes)
 
 
-@pytest.mark.parametrize("later_s", [0.0, 86_400.0])
+@pytest.mark.parametrize("later_s", [0.0, pytest.param(86_400.0, marks=pytest.mark.long)])
 def test_what_is_still_warm_goes_on(tmp_path: Path, later_s: float) -> None:
     """Two sensors do not show how warm they are. Of a recording in two files the second begins as the first ended, and
     the next day's begins cold."""

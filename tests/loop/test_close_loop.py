@@ -121,6 +121,7 @@ def test_a_survey_in_memory_gives_the_same_bits(found: ClosedLoop, surveys: tupl
     assert again.verdict == found.verdict
 
 
+@pytest.mark.long
 def test_a_total_field_that_is_known_needs_no_reference(surveys: tuple[Path, Path], found: ClosedLoop) -> None:
     total = found.dataset["detrended/total_field"]
     alone = Survey(xr.DataTree.from_dict({"/array": read_canonical(surveys[0]).tree["array"].to_dataset()}))

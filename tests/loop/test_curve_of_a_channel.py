@@ -70,7 +70,8 @@ def test_what_a_line_leaves_of_another_law_is_no_event(law: str) -> None:
     assert channel == "wind"
 
 
-@pytest.mark.parametrize("size", [0.4, pytest.param(1.5, marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("size", [0.4, 1.5])
 def test_an_event_is_no_curve_of_a_channel(size: float) -> None:
     """An offset for a while beside what is in proportion to a channel, weak and strong."""
     values = course(4)

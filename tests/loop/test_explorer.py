@@ -101,6 +101,7 @@ def test_the_loop_alone_is_close_loop(explorer: Explorer, survey: Path) -> None:
     assert "decisions" not in by_itself.verdict
 
 
+@pytest.mark.long
 def test_what_was_adopted_can_be_rejected(explorer: Explorer) -> None:
     explorer.run_loop()
     found = rms(explorer)

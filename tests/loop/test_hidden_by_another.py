@@ -39,12 +39,13 @@ def model(name: str, settings: dict[str, Any], *sensors: str) -> Adopted:
     return Adopted(Registry.load().find("error_model", name), settings, sensors)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("seed", "rate_Hz", "times"),
     [
         (5, 1.0, 2.0),
-        pytest.param(3, 2.0, 1.0, marks=pytest.mark.long),
-        pytest.param(6, 2.0, 2.0, marks=pytest.mark.long),
+        (3, 2.0, 1.0),
+        (6, 2.0, 2.0),
     ],
 )
 def test_a_step_and_a_temperature_are_found(seed: int, rate_Hz: float, times: float, tmp_path: Path) -> None:

@@ -67,7 +67,7 @@ def test_spikes_of_the_base_station_are_left_out(tmp_path: Path) -> None:
     assert not told["adopted"] and not told["unexplained"]["present"], told["unexplained"]["description"]
 
 
-@pytest.mark.parametrize("time_s", [10.0, 60.0])
+@pytest.mark.parametrize("time_s", [pytest.param(10.0, marks=pytest.mark.long), 60.0])
 @pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.long)])
 def test_noise_that_is_as_large_as_the_variation_is_no_excess_of_it(seed: int, time_s: float, tmp_path: Path) -> None:
     # half of what such a station records is not there at the site, sample by sample: a regression finds 50 %
@@ -86,7 +86,7 @@ def test_noise_that_is_as_large_as_the_variation_is_no_excess_of_it(seed: int, t
     assert "reference_scale" in told["unexplained"]["looks_like"]
 
 
-@pytest.mark.parametrize("excess", [0.7, -0.5])
+@pytest.mark.parametrize("excess", [0.7, pytest.param(-0.5, marks=pytest.mark.long)])
 def test_a_base_station_that_sees_another_variation_is_found(excess: float, tmp_path: Path) -> None:
     # 1 / 0.3 of the site's variation is recorded, or 1 / 1.5 of it; the array knows which part is missing
     def elsewhere(path: Path) -> None:
@@ -101,9 +101,10 @@ def test_a_base_station_that_sees_another_variation_is_found(excess: float, tmp_
     assert found["value"] == pytest.approx(100 * excess, abs=max(5 * found["std"], 2.0))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("jump_nT", "every_s"),
-    [pytest.param(3.0, 2.0, marks=pytest.mark.long), pytest.param(30.0, 2.0, marks=pytest.mark.long), (5.0, 10.0)],
+    [(3.0, 2.0), (30.0, 2.0), (5.0, 10.0)],
 )
 def test_a_jump_of_the_base_station_lies_between_its_readings(jump_nT: float, every_s: float, tmp_path: Path) -> None:
     def moved(path: Path) -> None:

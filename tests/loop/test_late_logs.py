@@ -28,7 +28,8 @@ def make_late(path: Path) -> None:
         logged[:] = np.concatenate([np.repeat(values[:1], LATE), values[:-LATE]])
 
 
-@pytest.mark.parametrize("rms_nT", [0.5, pytest.param(5.0, marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("rms_nT", [0.5, 5.0])
 def test_it_is_found_with_its_delay(rms_nT: float, tmp_path: Path) -> None:
     effect = {"type": "current_field", "channel": "current_heater", "rms_nT": rms_nT}
     models = ["current_field", "channel_response", "offset_drift"]

@@ -187,7 +187,7 @@ def test_a_strong_slow_effect_of_the_worse_of_two_sensors(tmp_path: Path) -> Non
 @pytest.mark.parametrize(
     "noise",
     [
-        {"flicker_nT_per_rtHz": 0.1},
+        pytest.param({"flicker_nT_per_rtHz": 0.1}, marks=pytest.mark.long),
         pytest.param({"flicker_nT_per_rtHz": 0.01, "flicker_exponent": 2.0}, marks=pytest.mark.long),
     ],
 )

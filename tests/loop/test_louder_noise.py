@@ -83,6 +83,7 @@ def test_what_only_the_loud_samples_have_seen_stays() -> None:
     assert not too_loud_in(rng.standard_normal((2000, 12)) * sd[:, None], z).any()
 
 
+@pytest.mark.long
 def test_a_survey_whose_second_half_is_louder_is_calibrated_with_the_first(tmp_path: Path) -> None:
     told = verdict_of(tmp_path, scenario(81), louder(0.6, 0.5, 1.0), MODELS)
     assert told["adopted"] == []

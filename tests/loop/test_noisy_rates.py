@@ -96,7 +96,7 @@ def test_the_noise_in_a_regressor_is_what_another_draw_of_the_noise_changes() ->
     ("noise_nT", "motion"),
     [
         ((330.0, 17.0), {"type": "limited_tilt", "duration_s": 500.0}),
-        ((21.0, 210.0, 17.0, 66.0), SLOWLY),
+        pytest.param((21.0, 210.0, 17.0, 66.0), SLOWLY, marks=pytest.mark.long),
         pytest.param((260.0, 170.0, 11.0), SLOWLY, marks=pytest.mark.long),
     ],
 )

@@ -182,9 +182,8 @@ def with_gap(seed: int, first: int, end: int, added: Array | None = None) -> Sta
     )  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    "slow", [{}, pytest.param({0: 0.1, 1: 0.1, 2: 0.1, 3: 0.1}, marks=pytest.mark.long)], ids=["white", "slow too"]
-)
+@pytest.mark.long
+@pytest.mark.parametrize("slow", [{}, {0: 0.1, 1: 0.1, 2: 0.1, 3: 0.1}], ids=["white", "slow too"])
 def test_a_jump_beside_a_gap_is_no_likelier_than_elsewhere(slow: dict[int, float]) -> None:
     """The last sample before a gap and the first after it have noise, which does not go on through the gap."""
     offset_step = Registry.load().find("error_model", "offset_step")
@@ -198,6 +197,7 @@ def test_a_jump_beside_a_gap_is_no_likelier_than_elsewhere(slow: dict[int, float
     assert np.mean(np.array(p) < 0.01) < 0.1
 
 
+@pytest.mark.long
 def test_slow_noise_goes_on_in_a_gap() -> None:
     """Half an hour is missing while an axis walks on: no jump that its own spectrum could not make."""
     offset_step = Registry.load().find("error_model", "offset_step")
@@ -247,7 +247,7 @@ def test_what_the_fit_takes_of_a_reference_is_no_evidence() -> None:
     assert OwnNoise(state.residual, None).p_value(constant) == 1.0
 
 
-@pytest.mark.parametrize("seed", [6, 8])
+@pytest.mark.parametrize("seed", [6, pytest.param(8, marks=pytest.mark.long)])
 def test_sensors_that_show_an_event_are_kept_with_it(seed: int) -> None:
     """0.1 nT for a fifth of the time: the scatter of long blocks shows it on one or two of the three."""
     offset_while = Registry.load().find("error_model", "offset_while")

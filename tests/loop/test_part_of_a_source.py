@@ -19,7 +19,6 @@ from magtensor.tensor.geometry import standard_geometry
 
 N = 2400
 BEGIN, END = 1000, 1060
-LONG = [pytest.param(seed, marks=pytest.mark.long) for seed in (1, 2)]
 EVENT, SOURCE = (Registry.load().find("error_model", name) for name in ("offset_while", "latent_source"))
 Array = NDArray[np.float64]
 
@@ -50,13 +49,15 @@ def test_its_vectors_tell(seed: int, sensors: tuple[str, ...], of_its_own: bool)
     assert not part_of_the_source(state, 1)
 
 
-@pytest.mark.parametrize("seed", [3, *LONG])
+@pytest.mark.long
+@pytest.mark.parametrize("seed", [3, 1, 2])
 def test_a_burst_of_the_source_is_no_event(seed: int) -> None:
     found = search(burst(seed, False)[0], [EVENT, SOURCE], Fitting())
     assert [a.name for a in found.last.adopted] == ["latent_source"]
 
 
-@pytest.mark.parametrize("seed", LONG)
+@pytest.mark.long
+@pytest.mark.parametrize("seed", [1, 2])
 def test_an_event_of_its_own_stays(seed: int) -> None:
     found = search(burst(seed, True)[0], [EVENT, SOURCE], Fitting())
     assert {a.name for a in found.last.adopted} == {"offset_while", "latent_source"}

@@ -53,7 +53,8 @@ def test_a_step_beside_another_model_is_tested_as_a_single_series(tmp_path: Path
     assert noise.p_value(step) == pytest.approx(noise.p_value(alone))
 
 
-@pytest.mark.parametrize("angles", [pytest.param(3, marks=pytest.mark.long), 6])
+@pytest.mark.long
+@pytest.mark.parametrize("angles", [3, 6])
 def test_what_changed_at_the_moment_of_a_jump_is_more_of_it(tmp_path: Path, angles: int) -> None:
     """A piece of iron has moved: the scale factor that changed stands for most of the jump of C, and a hundredth of
     that, which is an angle, is neither lost nor blamed on a temperature that rises."""
@@ -75,6 +76,7 @@ def test_what_changed_at_the_moment_of_a_jump_is_more_of_it(tmp_path: Path, angl
     assert not found["unexplained"]["present"], found["unexplained"]["description"]
 
 
+@pytest.mark.long
 def test_iron_that_was_moved_by_one_sensor_is_no_counter_of_samples(tmp_path: Path) -> None:
     """Every product of a steady channel with the field explains more than the scale factors of the jump alone do."""
 

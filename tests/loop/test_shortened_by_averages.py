@@ -44,9 +44,8 @@ def test_averages(tmp_path: Path, averaged: bool) -> None:
     assert found.verdict["adopted"] == []
 
 
-@pytest.mark.parametrize(
-    "also", [[], pytest.param([{"type": "temperature_offset", "rms_nT": 1.0, "lag_s": 60.0}], marks=pytest.mark.long)]
-)
+@pytest.mark.long
+@pytest.mark.parametrize("also", [[], [{"type": "temperature_offset", "rms_nT": 1.0, "lag_s": 60.0}]])
 def test_the_time_of_the_mean_is_found_and_taken_off_another_survey(
     tmp_path: Path, also: list[dict[str, object]]
 ) -> None:

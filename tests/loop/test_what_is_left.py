@@ -75,6 +75,7 @@ def test_a_small_waveform_that_predicts_nothing_is_not_told(share: float, told: 
     assert unexplained(replace(found, shared=shared), record)["present"] is told
 
 
+@pytest.mark.long
 def test_what_the_law_of_something_far_larger_may_miss_is_told_as_that(tmp_path: Path) -> None:
     """A base station that reads too little by 0.6 nT, beside an offset that jumps by some hundred."""
     step = {"type": "offset_step", "rms_nT": 300.0, "time_s": [500.0]}

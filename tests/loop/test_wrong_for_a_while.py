@@ -29,16 +29,17 @@ def twice_on_z(b: Array) -> Array:
     return b * [1.0, 1.0, 2.0]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("wrong", "first", "count", "effect"),
     [
-        pytest.param(x_negated, 1440, 96, True, marks=pytest.mark.long),
+        (x_negated, 1440, 96, True),
         (twice_on_z, 1680, 240, False),
-        pytest.param(x_negated, 1440, 96, False, marks=pytest.mark.long),
-        pytest.param(x_negated, 720, 440, False, marks=pytest.mark.long),
-        pytest.param(x_negated, 720, 440, True, marks=pytest.mark.long),
-        pytest.param(x_and_y_exchanged, 720, 288, True, marks=pytest.mark.long),
-        pytest.param(twice_on_z, 1680, 240, True, marks=pytest.mark.long),
+        (x_negated, 1440, 96, False),
+        (x_negated, 720, 440, False),
+        (x_negated, 720, 440, True),
+        (x_and_y_exchanged, 720, 288, True),
+        (twice_on_z, 1680, 240, True),
     ],
 )
 def test_it_is_flagged(wrong: Callable[[Array], Array], first: int, count: int, effect: bool, tmp_path: Path) -> None:

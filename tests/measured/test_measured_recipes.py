@@ -173,6 +173,7 @@ def test_the_loop_names_the_temperature_of_the_ak09916() -> None:
     assert after["RM3100"] < 400, "and the better sensor stays good"
 
 
+@pytest.mark.long
 def test_the_loop_hears_the_battery_current_where_the_flight_determines_no_calibration() -> None:
     """And no drift of the third order, which the screening likes and blocks held out do not."""
     import json
