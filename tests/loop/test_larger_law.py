@@ -11,7 +11,7 @@ import pytest
 from loop_cases import Array, adopted_names, linear_state, scenario, synthetic, verdict_of
 
 from magtensor.loop.evidence.assessment import estimated
-from magtensor.loop.evidence.statistics import Estimate
+from magtensor.loop.evidence.estimate import Estimate
 from magtensor.loop.fitting.model import Record
 from magtensor.loop.searching import larger_law
 from magtensor.loop.searching.gates import ALPHA

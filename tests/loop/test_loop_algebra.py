@@ -14,10 +14,10 @@ from magtensor.error_models.excitation import Excitation
 from magtensor.error_models.terms import REFERENCE, Terms, joined
 from magtensor.loop.evidence.assessment import Colours, colours_of, estimated, explained
 from magtensor.loop.evidence.colour import Colour
+from magtensor.loop.evidence.estimate import own_information, solve
 from magtensor.loop.evidence.grams import grams, held_out, normal
 from magtensor.loop.evidence.residual import Residual, residual_of, taken_off
 from magtensor.loop.evidence.scoring import Scorer, rarity
-from magtensor.loop.evidence.statistics import own_information, solve
 from magtensor.loop.fitting.model import Fitting, Record
 from magtensor.loop.fitting.seen import excitation_of
 from magtensor.loop.searching.search import search

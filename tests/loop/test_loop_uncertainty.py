@@ -12,7 +12,7 @@ from loop_cases import scenario, survey_file
 import magtensor
 from magtensor.applying import apply_to
 from magtensor.effect_errors import COVARIANCE
-from magtensor.loop.evidence.statistics import Estimate
+from magtensor.loop.evidence.estimate import Estimate
 from magtensor.loop.fitting.refit import without_noise
 from magtensor.result import open_result
 from magtensor.survey.model import without_variables

@@ -10,7 +10,7 @@ import xarray as xr
 from loop_cases import linear_state, scenario, survey_file, synthetic, verdict_of
 
 import magtensor
-from magtensor.loop.evidence.statistics import symmetric_eigen
+from magtensor.loop.evidence.estimate import symmetric_eigen
 from magtensor.loop.fitting.model import Adopted, Fitting
 from magtensor.loop.fitting.refit import joint_state
 from magtensor.loop.searching.contribution import eliminate, removal

@@ -10,13 +10,14 @@ import numpy as np
 from magtensor.calibration.types import Array
 from magtensor.error_models.terms import Terms, joined
 from magtensor.loop.evidence.colour import Colour, colour_of
+from magtensor.loop.evidence.estimate import Estimate, own_information, solve
 from magtensor.loop.evidence.folds import Blocks, known_until
 from magtensor.loop.evidence.gains import Gain, focused_gain, held_out_gain
 from magtensor.loop.evidence.grams import Grams, Whitened, grams, grams_in, normal
 from magtensor.loop.evidence.lone_event import elsewhere, left_of
 from magtensor.loop.evidence.own_noise import OwnNoise
 from magtensor.loop.evidence.residual import Residual, taken_off
-from magtensor.loop.evidence.statistics import Estimate, family_p, own_information, solve
+from magtensor.loop.evidence.statistics import family_p
 from magtensor.loop.evidence.turned import TurnedColour, excess_of, excess_of_one
 
 NEARLY_ALL = 0.9  # of what is explained: the average colour of the sensors' noise then has to suit one of them

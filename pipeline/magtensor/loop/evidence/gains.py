@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtensor.calibration.types import Array
+from magtensor.loop.evidence.estimate import own_information, theta_of_each
 from magtensor.loop.evidence.folds import FOLDS, Blocks
 from magtensor.loop.evidence.grams import Grams, held_out, normal
-from magtensor.loop.evidence.statistics import LEAST_BLOCKS, own_information, theta_of_each
+from magtensor.loop.evidence.statistics import LEAST_BLOCKS
 
 INTERLEAVED_FOLDS = 20
 LEAST_T = 2.0  # paired t of the held-out gain over folds

@@ -20,6 +20,7 @@ import numpy as np
 from magtensor.calibration.types import Array
 from magtensor.error_models.terms import REFERENCE, Terms, joined
 from magtensor.loop.evidence.columns import across_directions, along_the_field
+from magtensor.loop.evidence.estimate import IDENTIFIABLE, Own, identifiable
 from magtensor.loop.evidence.even_rate import EvenRate
 from magtensor.loop.evidence.one_series import one_series_p
 from magtensor.loop.evidence.other_times import as_at_other_times
@@ -33,13 +34,7 @@ from magtensor.loop.evidence.sensor_noise import (
     over_frequency,
     smoothed_spectrum,
 )
-from magtensor.loop.evidence.statistics import (
-    IDENTIFIABLE,
-    Own,
-    cauchy_combination,
-    fisher_combination,
-    identifiable,
-)
+from magtensor.loop.evidence.statistics import cauchy_combination, fisher_combination
 
 NOT_ASKED = 0.05  # p value, from which on nobody asks how likely it is
 LEAST_RESOLVED = 8  # frequencies, of the shortest surveys

@@ -8,9 +8,9 @@ from math import lgamma, log
 from magtensor.error_models.terms import Terms
 from magtensor.loop.evidence.assessment import Colours, estimated_in, explained
 from magtensor.loop.evidence.columns import Made
+from magtensor.loop.evidence.estimate import explained_by_each
 from magtensor.loop.evidence.grams import Whitened, grams_of_each
 from magtensor.loop.evidence.residual import Residual
-from magtensor.loop.evidence.statistics import explained_by_each
 
 
 class Scorer:

@@ -20,8 +20,8 @@ from magtensor.error_models.station import Station
 from magtensor.error_models.terms import Terms, joined
 from magtensor.errors import UsageError
 from magtensor.loop.evidence.assessment import Colours, colours_of
+from magtensor.loop.evidence.estimate import Estimate
 from magtensor.loop.evidence.residual import Residual
-from magtensor.loop.evidence.statistics import Estimate
 
 
 @dataclass(frozen=True)

@@ -21,8 +21,8 @@ from magtensor.error_models.needs import measured
 from magtensor.error_models.terms import Terms, joined
 from magtensor.errors import DataError, NotEnoughData
 from magtensor.loop.evidence.assessment import WHITE, Colours, colours_of, estimated, log_likelihood
+from magtensor.loop.evidence.estimate import Estimate
 from magtensor.loop.evidence.residual import Residual, quick, residual_of, taken_off
-from magtensor.loop.evidence.statistics import Estimate
 from magtensor.loop.evidence.stretches import borne_out, louder, too_loud
 from magtensor.loop.fitting.model import Adopted, Fitting, Record, State, unread
 from magtensor.loop.fitting.seen import beside_the_site, excitation_of

@@ -27,8 +27,8 @@ from magtensor.error_models.excitation import Excitation
 from magtensor.error_models.terms import REFERENCE, Terms, joined, stacked
 from magtensor.errors import DataError, NotEnoughData
 from magtensor.loop.evidence.assessment import Colours, colours_of, estimated
+from magtensor.loop.evidence.estimate import Estimate
 from magtensor.loop.evidence.residual import Levels, Residual, Sighted
-from magtensor.loop.evidence.statistics import Estimate
 from magtensor.loop.evidence.stretches import borne_out_in
 from magtensor.loop.evidence.turned import SlowModes, TurnedColour
 from magtensor.loop.fitting.model import Adopted, Record

@@ -11,7 +11,7 @@ import numpy as np
 
 from magtensor.calibration.types import Array
 from magtensor.error_models.terms import Terms
-from magtensor.loop.evidence.statistics import Estimate
+from magtensor.loop.evidence.estimate import Estimate
 from magtensor.loop.fitting.log_noise import brought_in, channels_of, would_bring_in
 from magtensor.loop.fitting.model import Adopted, State
 from magtensor.loop.searching.contribution import slices
