@@ -21,6 +21,7 @@ STEP = {"type": "offset_step", "time_s": [250.0], "nT": [[0.0] * 3, [0.6, -0.5, 
 SLIP = {"type": "lag_step", "time_s": 250.0, "lag_s": [[0.0] * 3, [0.02] * 3, [0.0] * 3, [0.0] * 3]}
 WARMING = {"type": "warm_up", "tau_s": 120.0, "nT": [[0.0] * 3, [2.0, -1.5, 1.0], [0.0] * 3, [0.0] * 3]}
 RETUNED = {"type": "scale_step", "time_s": [250.0], "ppm": [[0.0] * 3, [20.0, -15.0, 25.0], [0.0] * 3, [0.0] * 3]}
+MOVED = {"type": "reference_step", "time_s": [250.0], "steps_nT": [1.5]}
 Found = Callable[[dict[str, Any]], tuple[ClosedLoop, Path]]
 LATER = "2026-06-12T09:00:00Z"
 
@@ -180,3 +181,23 @@ def test_what_is_still_warm_goes_on(tmp_path: Path, later_s: float) -> None:
     b = done.calibration.apply(second)["calibrated/b"]
     error = np.linalg.norm(b[:, 1], axis=1) - field
     assert np.sqrt(np.mean(error[:240] ** 2)) < 0.18  # of noise 0.15 nT; taken wrongly it makes 1 nT
+
+
+@pytest.mark.parametrize("anew", [True, False])
+@pytest.mark.parametrize("effect", [FADING, MOVED], ids=lambda e: str(e["type"]))
+def test_lengths_tell_what_sensors_do_not(tmp_path: Path, effect: dict[str, Any], anew: bool) -> None:
+    """Two sensors, and a base station whose jump no sensor shows: lengths and total field say whether it is another."""
+    two = {"instrument": scenario()["instrument"] | {"array": {"positions_m": [[0.0] * 3, [0.5, 0.0, 0.0]]}}}
+    first = survey_file(tmp_path, of_a_day(5, effect) | two, "first.h5")
+    later = survey_file(tmp_path, of_a_day(6, *[effect] * anew, start=LATER) | two, "later.h5")
+    if not anew and effect is FADING:
+        with h5py.File(first) as file, h5py.File(later, "r+") as there:
+            there["b_raw"][...] += file[f"truth/effect_00_{FADING['type']}"][-1]
+    done = magtensor.close_loop(first, search=[effect["type"]])
+    assert [a["error_model"] for a in done.verdict["adopted"]] == [effect["type"]]
+    b = done.calibration.apply(later)["calibrated/b"]
+    assert b.attrs.get("begins_anew", "") == (effect["type"] if anew else "")
+    if anew:
+        with h5py.File(later) as file:
+            error = np.linalg.norm(b, axis=2) - file["truth/total_field_true"][()][:, None]
+        assert np.sqrt(np.mean(error**2)) < 0.17  # of noise 0.15 nT; the drift makes 0.6 nT

@@ -1,7 +1,6 @@
-"""What a survey began with and a calibration cannot know: the phase of a tone, the state of a response that lags, and
-from when the times of what drifts or happens count.
+"""What a survey began with and a calibration cannot know: the phase of a tone, and the state of a response that lags.
 
-All are found from the survey's own outputs, in what neither a uniform field nor a gradient can make of them, so that
+Both are found from the survey's own outputs, in what neither a uniform field nor a gradient can make of them, so that
 nothing a survey may be looking for is taken for an error of the instrument.
 """
 
@@ -16,7 +15,7 @@ from numpy.typing import NDArray
 from magtensor.calibration.by_sensor import by_sensor
 from magtensor.calibration.types import Array, ArrayCalibration
 from magtensor.error_models.excitation import Excitation
-from magtensor.error_models.settings import Beginning, Duration, EventTimes, profiled
+from magtensor.error_models.settings import Beginning, profiled
 from magtensor.loop.fitting.model import Adopted, Record
 from magtensor.tensor.geometry import array_design
 
@@ -24,9 +23,8 @@ TONE = "periodic_interference"
 WARM_UP = "warm_up"  # begins with every survey, warmer in one than in another
 LEAST_CONTRAST = 1e-4  # of an effect's own power, between the sensors
 SIGNIFICANT = 4.0  # standard deviations, of what is found on another survey
+ROUNDING = 1e-6  # nT: a course no larger is none
 LEAST_PARTS = 8  # of the survey, whose means tell how large slow noise is
-ANEW = 0.5  # of the difference between another start and the known one
-LONG = 1e11  # s, longer than any two surveys are apart
 
 
 def as_begun_here(
@@ -112,11 +110,11 @@ def _warmth_here(
     model, theta = own[number]
     if not shows_a_state(record.raw, record.position is not None):
         return theta
-    here = _Here.of(record, calibration)
+    here = Here.of(record, calibration)
     left, course = here.left(own), here.added(model, theta)
     if not len(left):
         return theta
-    part, known = _seen(left, course)
+    part, known = seen_in(left, course)
     return max(1.0 + part, 0.0) * theta if known else theta
 
 
@@ -143,7 +141,7 @@ def _state_here(
     none = dict.fromkeys(names, 0.0)
     if not shows_a_state(record.raw, record.position is not None):
         return none
-    here = _Here.of(record, calibration)
+    here = Here.of(record, calibration)
     model, theta = own[number]
     left = here.left(own)
     rest = here.added(model, theta)
@@ -162,7 +160,7 @@ def _state_here(
 
 
 @dataclass(frozen=True)
-class _Here:
+class Here:
     """What effects add to the outputs of a survey, and what is left of these without them, both as contrasts."""
 
     record: Record
@@ -171,7 +169,7 @@ class _Here:
     excitation: Excitation
 
     @classmethod
-    def of(cls, record: Record, calibration: ArrayCalibration) -> _Here:
+    def of(cls, record: Record, calibration: ArrayCalibration) -> Here:
         contrast = _Contrast.of(record, calibration)
         b = calibration.apply(np.where(contrast.usable[:, None, None], record.raw, 0.0))
         forward = np.asarray(np.linalg.inv(calibration.matrix), dtype=float)
@@ -199,48 +197,12 @@ def _variance(noise: Array, course: Array, parts: int) -> float:
     return max(float(np.var(along)), float(np.var(means)) * len(along) / len(means))
 
 
-def as_dated_here(
-    record: Record, calibration: ArrayCalibration, own: Sequence[tuple[Adopted, Array]], number: int
-) -> Adopted:
-    """An effect that is known to go with the time since the survey of the calibration began, as this survey shows it.
-
-    What the outputs say comes before the dates: a drift of what is switched on with the survey and a jump at the same
-    time of each begin anew, a jump was mended or has not happened yet, or the clock was never set. That has to be
-    nearer to the outputs, and its course to be seen in them whatever the offsets are, which differ from survey to
-    survey. A steady drift that goes on has the course of one that begins anew too, and is elsewhere.
-    """
-    model, theta = own[number]
-    if model.start is None or not shows_a_state(record.raw, record.position is not None):
-        return model
-    here = _Here.of(record, calibration)
-    dated, left = here.added(model, theta), here.left(own)
-    nearest, most = model, 0.0
-    for other in _otherwise(model, record):
-        course = here.added(other, theta) - dated
-        nearer = 2.0 * float(np.sum(left * course)) - float(np.sum(course**2))
-        part, known = _seen(left, course)
-        if nearer > most and part > ANEW and known:
-            nearest, most = other, nearer
-    return nearest
-
-
-def _otherwise(model: Adopted, record: Record) -> list[Adopted]:
-    """An effect that begins anew with a survey, one that happened before it, and one that has not yet.
-
-    A slip of a recorder, which ends with the survey as a rule, goes on where it was before.
-    """
-    marks = profiled(model.component).items()
-    lasts = [name for name, mark in marks if isinstance(mark, Duration)]
-    slips = lasts and any(isinstance(mark, EventTimes) for _, mark in marks)
-    goes_on = dict.fromkeys(lasts, 3.0 * LONG) if slips else {}
-    before = replace(model, start=float(record.time[0]) - LONG, settings={**model.settings, **goes_on})
-    return [replace(model, start=None), before, replace(model, start=float(record.time[-1]) + LONG)]
-
-
-def _seen(left: Array, course: Array) -> tuple[float, bool]:
+def seen_in(left: Array, course: Array) -> tuple[float, bool]:
     """How much of a course (n, 3 S) there is in what is left, whatever the offsets are, and whether noise is less."""
     left, course = left - left.mean(axis=0), course - course.mean(axis=0)
     power = float(np.sum(course**2))
-    part = float(np.sum(left * course)) / power if power > 0 else 0.0
+    if power <= ROUNDING**2 * course.size:
+        return 0.0, False
+    part = float(np.sum(left * course)) / power
     variance = _variance(left - part * course, course, LEAST_PARTS)
     return part, part**2 * power > SIGNIFICANT**2 * variance

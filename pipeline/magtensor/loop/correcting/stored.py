@@ -16,9 +16,10 @@ from magtensor.error_models.needs import FACTS
 from magtensor.error_models.settings import NOT_KNOWN, AnyChannel, Beginning, Duration, EventTimes, profiled
 from magtensor.error_models.waveform import NAME
 from magtensor.errors import DataError, UsageError
-from magtensor.loop.correcting.another_survey import LONG, TONE, WARM_UP, as_dated_here, shows_a_state, unknown
+from magtensor.loop.correcting.another_survey import TONE, WARM_UP, shows_a_state, unknown
 from magtensor.loop.correcting.beyond import seen_here
 from magtensor.loop.correcting.correction import corrected_raw, corrected_reference, hidden_objection
+from magtensor.loop.correcting.dates import LONG, as_dated_here
 from magtensor.loop.correcting.lengths import AVERAGING, averaged_otherwise, contradicted
 from magtensor.loop.fitting.model import Adopted, Record, unread
 from magtensor.loop.fitting.record import record_of
@@ -98,8 +99,8 @@ def on_its_clock(
 ) -> list[Adopted]:
     """Effects of a calibration as they are on another survey: what happened at a time has happened since then.
 
-    A jump stays, and a drift holds its last value, unless the survey's own outputs show that it begins anew, happened
-    before or has not yet. Warming up begins with every survey, but goes on in one that follows sooner than the
+    A jump stays, and a drift holds its last value, unless the survey itself shows that it begins anew, happened before
+    or has not yet. Warming up begins with every survey, but goes on in one that follows sooner than the
     electronics could cool, and what a lagged response began with is another survey's own.
     """
     facts = calibration["calibration/effects"].attrs if adopted else {}
@@ -110,14 +111,15 @@ def on_its_clock(
     known = begun_with(adopted, begun, survey)
     if end is not None:
         known = [replace(a, start=_seconds(begun, survey)) if _still_warm(a, end, survey) else a for a in known]
-    dated = [i for i, a in enumerate(known) if a.start is not None and a.component.effect == "instrument"]
+    moved = [i for i, a in enumerate(known) if a.component.effect != "site"]
+    dated = [i for i in moved if _of_a_time(known[i])]  # how warm a survey begins is asked elsewhere
     if not dated:
         return known
     record = record_of(survey, origins=origins, every=True)
-    own = [i for i, a in enumerate(known) if a.component.effect == "instrument" and not _lacking(a, record)]
+    own = [i for i in moved if not _lacking(known[i], record)]
     own = [i for i in own if known[i].name != NAME]  # its waveform here is found when the others are taken off
     effects = [(known[i], theta[i]) for i in own]
-    here = {i: as_dated_here(record, fitted, effects, own.index(i)) for i in dated if i in own}
+    here = {i: as_dated_here(record, fitted, effects, own.index(i), survey.good) for i in dated if i in own}
     return [here.get(i, a) for i, a in enumerate(known)]
 
 
