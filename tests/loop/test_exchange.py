@@ -14,7 +14,7 @@ from magtensor.loop.evidence.assessment import assess
 from magtensor.loop.evidence.grams import Whitened
 from magtensor.loop.fitting.model import Adopted, Fitting, State
 from magtensor.loop.fitting.refit import joint_state
-from magtensor.loop.searching.exchange import simpler
+from magtensor.loop.searching.exchange import exchange
 from magtensor.loop.searching.found import Step
 from magtensor.loop.searching.gates import Candidate
 from magtensor.registry import Registry
@@ -74,8 +74,51 @@ def test_a_channel_through_a_lag_longer_than_the_survey_is_no_simpler_drift(
     assert first.passes and second.passes
     adopted = [first.model, Adopted(registry.find("error_model", "cross_field"), {})]
     after = joint_state(record, adopted, Fitting())
-    found = simpler(after, [Step(state, (first, second), first)], 0)
-    assert (found is not None and found[1].model.name == "temperature_scale") is takes_its_place
+    found = exchange(after, [Step(state, (first, second), first)], 0)
+    assert (found is not None and found.other.model.name == "temperature_scale") is takes_its_place
+
+
+@pytest.mark.parametrize("warms", [True, False])
+def test_what_predicts_better_takes_the_place_of_what_was_adopted(warms: bool) -> None:
+    """A temperature that rises and sways, and a line in time, of as many coefficients."""
+    registry = Registry.load()
+    time = np.arange(1200) / 1200.0
+    sways = time + 0.3 * np.sin(2.0 * np.pi * 3.0 * time)
+    plain = synthetic(51, noise_nT=0.3, turning_s=4.0)
+    drawn = np.random.default_rng(3).standard_normal((4, 3))
+    added = plain.raw * 2e-5 * (sways if warms else time)[:, None, None] * drawn
+    record = replace(
+        synthetic(51, noise_nT=0.3, turning_s=4.0, added=added), logged={"temperature": 20.0 + 10.0 * sways},
+        origins={"temperature": np.zeros(())}, units={"temperature": "degC"},
+    )  # fmt: skip
+    state = linear_state(record)
+    drift, other = (registry.find("error_model", name) for name in ("scale_drift", "temperature_scale"))
+    settings = {"order": 1, "channel": "temperature", "lag_s": 0.0, "delayed": False, "at_start": 0.0}
+    first, second = (
+        looked_at(state, Adopted(drift, {"order": 1, "span_s": 1200.0})),
+        looked_at(state, Adopted(other, settings)),
+    )
+    assert first.passes and second.passes and first.terms.count == second.terms.count
+    adopted = [first.model, Adopted(registry.find("error_model", "cross_field"), {})]
+    found = exchange(joint_state(record, adopted, Fitting()), [Step(state, (first, second), first)], 0)
+    assert (found is not None) is warms
+    if found is not None:
+        assert found.better and found.other.model.name == "temperature_scale"
+        assert "temperature_scale" in found.why and "better" in found.why
+
+
+@pytest.mark.long
+def test_a_temperature_refused_for_a_drift_beside_a_flexure_is_asked_again(tmp_path: Path) -> None:
+    """While the flexure has no name, smooth courses of time follow a part of it, and seem to know more than the
+    temperature."""
+    effects = ({"type": "frame_flexure", "rms_nT": 1.0}, {"type": "temperature_alignment", "rms_nT": 1.0})
+    motion = {"type": "limited_tilt", "duration_s": 1200.0, "tilt_deg": 40.0}
+    logging = {"attitude": True, "acceleration": True}
+    models = ("frame_flexure", "temperature_alignment", "alignment_drift", "turn_step")
+    for seed in (33, 34):
+        told = verdict_of(tmp_path, scenario(seed, *effects, motion=motion, logging=logging), models=models)
+        assert adopted_names(told) == {"frame_flexure", "temperature_alignment"}
+        assert not told["unexplained"]["present"], told["unexplained"]["description"]
 
 
 def looked_at(state: State, model: Adopted) -> Candidate:

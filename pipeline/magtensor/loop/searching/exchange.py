@@ -2,12 +2,14 @@
 
 While other effects have no name yet, the model with more coefficients follows a part of them, and held-out blocks bear
 it out: a source near the rig explains more than a gradient of the site beside a nonlinearity that nobody has added.
-Beside all that was adopted later one with fewer coefficients may do as well; then it takes its place.
+Beside all that was adopted later one with fewer coefficients may do as well, and one that was refused for it may be
+seen to do better; then it takes its place.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 from magtensor.loop.fitting.model import State, generic
 from magtensor.loop.fitting.separation import fold_gain, separated
@@ -18,33 +20,57 @@ from magtensor.loop.searching.rivals import hardly_begun
 from magtensor.loop.searching.screening import candidates_of
 
 
-def simpler(state: State, steps: Sequence[Step], fixed: int) -> tuple[int, Candidate] | None:
-    """The place of an adopted model, not of the first ones, and one with fewer coefficients that passed in the same
-    round and beside all others predicts held-out blocks as well; None where every model is the simplest."""
+@dataclass(frozen=True)
+class Exchange:
+    """A model to take the place of an adopted one.
+
+    Attributes:
+        place: of the adopted one; other: the model, as it was looked at in the round of that one.
+        better: whether it predicts better; it does as well with fewer coefficients if not.
+    """
+
+    place: int
+    other: Candidate
+    better: bool
+
+    @property
+    def why(self) -> str:
+        """Why the adopted one has to go."""
+        name = self.other.model.name
+        if self.better:
+            return f"{name}, which passed too, predicts held-out blocks better beside the others"
+        return f"{name}, which has fewer coefficients, does as well beside the others"
+
+
+def exchange(state: State, steps: Sequence[Step], fixed: int) -> Exchange | None:
+    """One for an adopted model, not of the first ones, by what passed in the same round, has no more coefficients, and
+    beside all others predicts held-out blocks as well with fewer of them, or better; None where every model is the one
+    to have."""
     names = {a.name for a in state.adopted}
     for place in range(fixed, len(state.adopted) - 1):  # beside the last nothing is new
         own = slices(state)[place]
+        size = own.stop - own.start
         step = next((s for s in steps if s.adopted and s.adopted.model.name == state.adopted[place].name), None)
         if step is None:
             continue
-        fewer = (c for c in step.candidates if c.passes and c.terms.count < own.stop - own.start)
-        for other in sorted(fewer, key=lambda c: c.terms.count):
-            # what lags by half the survey can be any drift, and is simpler than none
-            known = other.model.name not in names and not hardly_begun(other.model, state.excitation)
-            if known and not generic(other.model) and _as_good(state, place, other):
-                return place, other
+        # what lags by half the survey can be any drift, and is simpler than none
+        others = [
+            c for c in step.candidates
+            if c.passes and c.terms.count <= size and c.model.name not in names and not generic(c.model)
+            and not hardly_begun(c.model, state.excitation)
+        ]  # fmt: skip
+        if not others:
+            continue
+        assert state.terms is not None
+        without = put_back_one(state, place)
+        mine = fold_gain(without, state.colours, state.terms.only(range(own.start, own.stop)))
+        for other in sorted(others, key=lambda c: c.terms.count):
+            theirs = fold_gain(without, state.colours, other.model.terms(state.excitation).at(state.residual.samples))
+            if separated(theirs, mine):
+                return Exchange(place, other, True)
+            if other.terms.count < size and not separated(mine, theirs):
+                return Exchange(place, other, False)
     return None
-
-
-def _as_good(state: State, place: int, other: Candidate) -> bool:
-    """Whether held-out blocks do not tell an adopted model from another one beside the rest of them."""
-    assert state.terms is not None
-    own = slices(state)[place]
-    mine = state.terms.only(range(own.start, own.stop))
-    without = put_back_one(state, place)
-    theirs = other.model.terms(state.excitation).at(state.residual.samples)
-    best, found = (fold_gain(without, state.colours, terms) for terms in (mine, theirs))
-    return not separated(best, found)
 
 
 def looked_at_again(state: State, other: Candidate, models: int) -> Candidate | None:

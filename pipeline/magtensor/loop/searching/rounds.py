@@ -17,7 +17,7 @@ from magtensor.loop.remainder.tones import channels_of_the_line, tones
 from magtensor.loop.searching.any_law import by_a_curve, by_any_law, by_any_law_of
 from magtensor.loop.searching.contribution import eliminate, tones_of, without_models
 from magtensor.loop.searching.course_of_time import beside_time, rivals_in_time
-from magtensor.loop.searching.exchange import looked_at_again, simpler
+from magtensor.loop.searching.exchange import exchange, looked_at_again
 from magtensor.loop.searching.found import Step
 from magtensor.loop.searching.gates import Candidate
 from magtensor.loop.searching.keeping import ONE_OF_A_KIND, UNEARNED, Fitted, fitted, fitted_everywhere, why_not
@@ -348,21 +348,22 @@ def _outdone(chosen: Candidate, state: State) -> str:
 def _exchanged(
     record: Record, state: State, steps: Sequence[Step], how: Fitting, fixed: int, models: int
 ) -> tuple[Trial, Step] | None:
-    """The fit with a simpler model in the place of an adopted one that it does as well as, and the round's story."""
-    found = simpler(state, steps, fixed)
+    """The fit with another model in the place of an adopted one that it does as well as, or better, and the round's
+    story."""
+    found = exchange(state, steps, fixed)
     if found is None:
         return None
-    place, other = found
-    old = state.adopted[place].name
-    without = without_models(record, state, [place], how)
-    chosen = looked_at_again(without, other, models)
-    if chosen is None:
+    old = state.adopted[found.place].name
+    without = without_models(record, state, [found.place], how)
+    chosen = looked_at_again(without, found.other, models)
+    if chosen is None or (found.better and beside_time(chosen, without).refused):
         return None
-    tried = fitted(record, trial(record, without, how), chosen, how)
-    if tried.after is None or tried.why:
+    before = trial(record, without, how)
+    tried = fitted(record, before, chosen, how)
+    if tried.after is None or tried.why or (found.better and per_sample(tried.after.state) <= per_sample(state)):
         return None
-    why = f"{chosen.model.name}, which has fewer coefficients, does as well beside the others"
-    return tried.after, Step(without, (chosen,), chosen, (old,), refused={old: why})
+    rivals = () if found.better else (old,)
+    return tried.after, Step(without, (chosen,), chosen, rivals, refused={old: found.why})
 
 
 def _source_instead(
