@@ -17,7 +17,7 @@ from magtensor.loop.searching import rivals
 from magtensor.loop.searching.gates import Candidate
 from magtensor.loop.searching.keeping import why_not
 from magtensor.loop.searching.likeness import event_along
-from magtensor.loop.searching.on_more_sensors import on_more_sensors
+from magtensor.loop.searching.on_more_sensors import in_the_place_of_others, on_more_sensors
 from magtensor.loop.searching.screening import candidates_of
 from magtensor.registry import Registry
 
@@ -134,6 +134,30 @@ def test_an_effect_goes_to_the_sensors_that_show_it_and_to_no_other(warmed: Reco
     assert found.state.adopted[0].sensors == ("S1", "S2", "S3")
     assert (found is standing) is (len(begun) == 3)
     assert len(found.state.theta[0]) == 9 and found.state.residual.square() < 1.3
+
+
+@pytest.mark.parametrize("another", [False, True])
+def test_what_has_more_coefficients_elsewhere_may_be_the_same_effect(tmp_path: Path, another: bool) -> None:
+    """All sensors warm up, and one of them is said to drift; or that one drifts, and steadily."""
+    everywhere = [[1.5, -0.3, 0.6], [0.9, -1.2, -0.7], [-2.2, 1.4, -2.1], [-2.0, 2.0, -1.8]]
+    warming = [vector if not (another and i == 1) else [0.0] * 3 for i, vector in enumerate(everywhere)]
+    effects = [{"type": "warm_up", "tau_s": 300.0, "nT": warming}]
+    if another:
+        effects.append({"type": "offset_drift", "nT_per_h": [4.0, -3.0, 5.0], "sensors": ["S2"]})
+    record = loaded(tmp_path, scenario(4, *effects, motion=TILTED, rate_Hz=1.0))
+    adopted = [
+        model("warm_up", {"tau_s": 300.0}, "S1", "S3", "S4"),
+        model("offset_drift", {"order": 3, "span_s": float(np.ptp(record.time)), "law": "time"}, "S2"),
+    ]
+    standing = trial(record, joint_state(record, adopted, Fitting()), Fitting())
+    found, gone = in_the_place_of_others(record, standing, Fitting(), [0, 1])
+    if another:
+        assert found is standing and not gone
+        return
+    assert gone == ("offset_drift",)
+    (kept,) = found.state.adopted
+    assert kept.name == "warm_up" and not kept.sensors
+    np.testing.assert_allclose(found.state.theta[0], np.ravel(everywhere), atol=0.15)
 
 
 @pytest.mark.parametrize(

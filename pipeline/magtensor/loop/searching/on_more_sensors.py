@@ -1,11 +1,13 @@
 """Adopted effects on the sensors that show them only now.
 
 A sensor on which an effect was cancelled by another one, or lay along one, was left out when it was adopted. Beside
-what has been found since it may show it as clearly as the others do.
+what has been found since it may show it as clearly as the others do; and what another model took up there meanwhile may
+be nothing else.
 """
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -16,9 +18,10 @@ from magtensor.error_models.waveform import NAME
 from magtensor.loop.evidence.assessment import estimated, explained
 from magtensor.loop.fitting.model import Adopted, Fitting, Record, State
 from magtensor.loop.fitting.refit import joint_state
+from magtensor.loop.fitting.separation import fold_gain, separated
 from magtensor.loop.fitting.trial import Trial, on_the_folds_of, trial
 from magtensor.loop.searching.adopting import narrowed, sensors_showing
-from magtensor.loop.searching.contribution import KEEP_ALPHA
+from magtensor.loop.searching.contribution import KEEP_ALPHA, put_back_one, slices, without_models
 
 
 def on_more_sensors(record: Record, standing: Trial, how: Fitting, places: Sequence[int]) -> Trial:
@@ -41,6 +44,48 @@ def on_more_sensors(record: Record, standing: Trial, how: Fitting, places: Seque
         if not before.hurt_by(tried) and before.likelier(tried):
             standing = tried
     return standing
+
+
+def in_the_place_of_others(
+    record: Record, standing: Trial, how: Fitting, places: Sequence[int]
+) -> tuple[Trial, tuple[str, ...]]:
+    """The fit with some of the adopted models on the sensors, too, of another one of them that acts on none of their
+    own, and without that one, where held-out blocks do not tell the two apart and its coefficients are more; and the
+    names of those that are gone."""
+    gone: list[str] = []
+    left = list(places)
+    while (pair := _as_well(standing.state, left)) is not None:
+        place, other = pair
+        state = standing.state
+        wide = _on(record, state, place, (*state.adopted[place].sensors, *state.adopted[other].sensors), how)
+        tried = trial(record, without_models(record, wide, [other], how), how)
+        left.remove(place)  # each once
+        if on_the_folds_of(tried, record, standing, how).hurt_by(tried):
+            continue
+        gone.append(state.adopted[other].name)
+        left = [i - (i > other) for i in left if i != other]
+        standing = tried
+    return standing, tuple(gone)
+
+
+def _as_well(state: State, places: Sequence[int]) -> tuple[int, int] | None:
+    """The places of an adopted model and of one on other sensors in whose place it would do there."""
+    x, models = state.excitation, state.adopted
+    for place, other in itertools.permutations(places, 2):
+        mine, theirs = models[place].sensors, models[other].sensors
+        kinds = {models[i].component.effect for i in (place, other)}
+        if not mine or not theirs or set(mine) & set(theirs) or kinds != {"instrument"} or models[place].name == NAME:
+            continue
+        own = slices(state)[other]
+        wider = replace(models[place], sensors=theirs).terms(x).at(state.residual.samples)
+        if not 0 < wider.count < own.stop - own.start:
+            continue
+        assert state.terms is not None
+        without = put_back_one(state, other)
+        best = fold_gain(without, state.colours, state.terms.only(range(own.start, own.stop)))
+        if not separated(best, fold_gain(without, state.colours, wider)):
+            return place, other
+    return None
 
 
 def _that_may_show(state: State, place: int) -> list[str]:

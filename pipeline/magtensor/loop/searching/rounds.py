@@ -24,7 +24,7 @@ from magtensor.loop.searching.keeping import ONE_OF_A_KIND, UNEARNED, Fitted, fi
 from magtensor.loop.searching.larger_law import part_of_a_gradient, part_of_a_larger_law
 from magtensor.loop.searching.latent import NAME, Sought, Source, renewed, sought, tried_source
 from magtensor.loop.searching.likeness import followed_by_a_curve, part_of_the_source
-from magtensor.loop.searching.on_more_sensors import on_more_sensors
+from magtensor.loop.searching.on_more_sensors import in_the_place_of_others, on_more_sensors
 from magtensor.loop.searching.own_fit import at_their_own_fit
 from magtensor.loop.searching.profiling import repeatable
 from magtensor.loop.searching.rivals import (
@@ -125,7 +125,10 @@ class Rounds:
                 record, state = renewed(record, adopted.standing.state, how)
                 earlier = range(self.fixed, len(state.adopted) - 1)
                 standing = on_more_sensors(record, replace(adopted.standing, state=state), how, earlier)
+                standing, gone = in_the_place_of_others(record, standing, how, earlier)
                 state = standing.state
+                if gone:
+                    steps[-1] = replace(steps[-1], dropped=(*steps[-1].dropped, *gone))
                 if by_a_curve(state.adopted[-1]):  # of more pieces, before anything is adopted for what it leaves
                     standing, more = by_any_law(
                         record, standing, how, [len(state.adopted) - 1], self.alpha, open_, self.fixed
