@@ -15,7 +15,7 @@ from magtensor.loop.fitting.refit import joint_state
 from magtensor.loop.fitting.trial import trial
 from magtensor.loop.searching import rivals
 from magtensor.loop.searching.gates import Candidate
-from magtensor.loop.searching.keeping import why_not
+from magtensor.loop.searching.keeping import _missed_on, why_not
 from magtensor.loop.searching.likeness import event_along
 from magtensor.loop.searching.on_more_sensors import in_the_place_of_others, on_more_sensors
 from magtensor.loop.searching.screening import candidates_of
@@ -134,6 +134,12 @@ def test_an_effect_goes_to_the_sensors_that_show_it_and_to_no_other(warmed: Reco
     assert found.state.adopted[0].sensors == ("S1", "S2", "S3")
     assert (found is standing) is (len(begun) == 3)
     assert len(found.state.theta[0]) == 9 and found.state.residual.square() < 1.3
+
+
+@pytest.mark.parametrize(("sensor", "missed"), [("S3", True), ("S4", False)])
+def test_a_sensor_that_shows_an_effect_is_not_spared_it(warmed: Record, sensor: str, missed: bool) -> None:
+    state = joint_state(warmed, [model("temperature_offset", FOLLOWING, "S1", "S2")], Fitting())
+    assert _missed_on(state, 0, [sensor]) is missed
 
 
 @pytest.mark.parametrize("another", [False, True])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from magtensor.error_models.excitation import Excitation
@@ -9,6 +10,7 @@ from magtensor.error_models.settings import Range, profiled
 from magtensor.errors import DataError
 from magtensor.loop.fitting.log_noise import channels_of
 from magtensor.loop.fitting.model import Adopted, Fitting, Record, State
+from magtensor.loop.fitting.separation import SEPARATION, fold_gain
 from magtensor.loop.fitting.trial import Trial, on_the_folds_of, trial
 from magtensor.loop.remainder.changing_matrix import channel_instead
 from magtensor.loop.remainder.curve_of_a_channel import event_of_a_curve
@@ -64,10 +66,20 @@ def fitted(record: Record, before: Trial, chosen: Candidate, how: Fitting) -> Fi
             fewer = trial(record, narrowed(record, after.state, which, tuple(helped), how), how)
             before = on_the_folds_of(fewer, record, before, how)
             if not before.hurt_by(fewer):
-                after, hurt = fewer, []
+                if not _missed_on(fewer.state, which, hurt):
+                    after = fewer
+                hurt = []
     if hurt:
         return Fitted(after, f"fitted, it raises the held-out error of {', '.join(hurt)}", tuple(hurt))
     return Fitted(after, why_not(record, before, after, chosen, how))
+
+
+def _missed_on(state: State, which: int, sensors: Sequence[str]) -> bool:
+    """Whether one of the models, taken off some sensors, would predict held-out blocks on them: their |b| - F is worse
+    with it by something slow, as an error of the base station is, and all that is known of them is not."""
+    own = replace(state.adopted[which], sensors=tuple(sensors)).terms(state.excitation).at(state.residual.samples)
+    gain = fold_gain(state, state.colours, own)
+    return gain.total >= SEPARATION + own.count and gain.consistent
 
 
 def fitted_everywhere(record: Record, before: Trial, chosen: Candidate, how: Fitting) -> Fitted:
