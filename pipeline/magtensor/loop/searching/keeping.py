@@ -79,7 +79,7 @@ def _missed_on(state: State, which: int, sensors: Sequence[str]) -> bool:
     with it by something slow, as an error of the base station is, and all that is known of them is not."""
     own = replace(state.adopted[which], sensors=tuple(sensors)).terms(state.excitation).at(state.residual.samples)
     gain = fold_gain(state, state.colours, own)
-    return gain.total >= SEPARATION + own.count and gain.consistent
+    return bool(gain.total >= SEPARATION + own.count and gain.consistent)
 
 
 def fitted_everywhere(record: Record, before: Trial, chosen: Candidate, how: Fitting) -> Fitted:
