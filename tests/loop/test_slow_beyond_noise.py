@@ -27,6 +27,19 @@ def test_an_offset_that_moves_within_a_minute_is_told(tmp_path: Path, nT: float,
     assert not told or "mostly on S2" in left["description"]
 
 
+def test_noise_of_the_base_station_is_nothing_that_moved(tmp_path: Path) -> None:
+    """2 nT in each reading, where a sensor has 0.15."""
+
+    def noisier(path: Path) -> None:
+        with h5py.File(path, "r+") as file:
+            field = file["reference/total_field"]
+            field[:] += 2.0 * np.random.default_rng(8).standard_normal(len(field))
+
+    found = verdict_of(tmp_path, scenario(72), noisier, models=["offset_step", "temperature_offset", "offset_drift"])
+    left = found["unexplained"]
+    assert found["adopted"] == [] and not left["present"], left["description"]
+
+
 def test_noise_that_goes_with_1_over_f_has_no_more_than_three_times_its_white_part() -> None:
     """Over the longest surveys, at all frequencies: the white part as second differences have it."""
     rng = np.random.default_rng(5)

@@ -60,7 +60,7 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
     flagged = lasting(bad, beyond_the_reference(state, record)) | starts
     suspects = Suspects.of(found, flagged, sparse)
     words = [*_what_shows(found, record, excess, sparse), *suspects.words]
-    times = excess / state.residual.scale
+    times = _slow(state, record) / state.residual.scale
     if not words and times > NO_NOISE:
         words.append(
             f"it is slow, and {times:.2g} times the white noise, where noise with a power of 1/f has three at most: "
@@ -131,8 +131,7 @@ def noise_words(state: State, record: Record) -> list[str]:
     """What is left where nothing is unexplained, and what of it is not white where that is more than what is."""
     residual, white, words = state.residual, state.residual.scale, [NOISE]
     if residual.across is not None:
-        values = len(residual.across) * (residual.freedom - (residual.along is not None))
-        slow = white * max(float(np.sum(residual.across**2)) / values - 1.0, 0.0) ** 0.5
+        slow = slow_across(residual)
         if slow > white:
             words.append(f"{slow:.3g} nT rms is not white, {_on_sensors(state)}")
         else:
@@ -163,6 +162,22 @@ def slow_along(state: State) -> float:
     if residual.along is None:
         return 0.0
     return max(float(np.mean((residual.along**2 - 1.0) / residual.reference_gain**2)), 0.0) ** 0.5
+
+
+def slow_across(residual: Residual) -> float:
+    """nT rms beyond white noise of what the sensors differ by; 0 of a single one."""
+    if residual.across is None:
+        return 0.0
+    values = len(residual.across) * (residual.freedom - (residual.along is not None))
+    return residual.scale * max(float(np.sum(residual.across**2)) / values - 1.0, 0.0) ** 0.5
+
+
+def _slow(state: State, record: Record) -> float:
+    """nT rms beyond white noise of what the sensors differ by; of a single one of |b| - F, the base station's own
+    noise taken off."""
+    if state.residual.across is not None:
+        return slow_across(state.residual)
+    return max(slow_along(state) ** 2 - of_the_station(state, record) ** 2, 0.0) ** 0.5
 
 
 def loud_words(state: State, record: Record, how: Fitting) -> list[str]:
