@@ -317,7 +317,7 @@ def _flagged(
     good = survey.good_by_sensor.copy()
     flags: list[Flag] = []
     repeating = "the same numbers for longer than chance explains"
-    frozen = repeated.frozen(field)
+    frozen, nothing = repeated.frozen(field), checks.zeros(field)
     if frozen.any():
         flags += flag_ranges(time, frozen, by=BY, reason="frozen: no sensor gives a new number")
         good &= ~frozen[:, None]
@@ -329,6 +329,7 @@ def _flagged(
         others = np.delete(field, s, axis=1) if field.shape[1] > 1 else None
         for bad, reason in (
             (missing, "missing value"),
+            (nothing[:, s], "zero on all axes"),
             *((bad, reason) for reason, bad in known.items()),
             (
                 np.asarray(rails.any(axis=1)),

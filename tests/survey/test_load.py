@@ -140,6 +140,18 @@ def test_missing_and_infinite_values_are_flagged(load_variables: Load, variables
     assert (survey.flags[0].start, survey.flags[0].stop) == (2.0, pytest.approx(2.9))
 
 
+def test_zero_on_all_axes_is_no_field(load_variables: Load, variables: Variables) -> None:
+    dims, values, attributes = variables["b_raw"]
+    values = np.array(values)
+    values[5, 1], values[7:9, [0, 3]] = 0.0, 0.0
+    values[11, 2, 0] = 0.0  # on one axis a field may be
+    survey = load_variables({**variables, "b_raw": (dims, values, attributes)})
+    assert {(f.sensor, f.samples, f.reason) for f in survey.flags} == {
+        (name, count, "zero on all axes") for name, count in (("S1", 2), ("S2", 1), ("S4", 2))
+    }
+    assert np.flatnonzero(~survey.good).tolist() == [5, 7, 8]
+
+
 def test_too_many_missing_values(load_variables: Load, variables: Variables) -> None:
     damaged = changed(variables, "b_raw", set_to((slice(0, 300), 1), np.nan))
     with pytest.raises(DataError, match=r"sensor S2: 75 % of its samples cannot be used: missing value"):

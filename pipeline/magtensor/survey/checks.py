@@ -26,6 +26,15 @@ RIVALS = (
 )  # fmt: skip
 
 
+def zeros(field: Floats) -> Bools:
+    """(N, S) where a sensor gives zero on all axes of (N, S, 3) nT at once, and usually does not: no field does that,
+    but a logger does that has nothing to write."""
+    nothing = np.asarray((field == 0.0).all(axis=2))
+    usual = nothing.mean(axis=0) < 0.5
+    out: Bools = nothing & usual
+    return out
+
+
 def impossible(field: Floats) -> Bools:
     """(N, S, 3) True where a value is `IMPOSSIBLE` times as large as the sensor's median magnitude.
 

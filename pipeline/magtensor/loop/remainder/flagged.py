@@ -16,6 +16,7 @@ from magtensor.loop.fitting.refit import without
 from magtensor.loop.remainder.sparse_readings import SparseReadings
 
 LONGEST_SPIKE = 2  # samples: what lasts longer is no accident of the recording
+HYSTERESIS = "hysteresis"
 UNCOVERED = 2.0  # steps between samples
 ALIKE = 0.1  # of the mean square along the field, across it: an effect on each sensor shows as much in both
 AT_AN_END = 0.95  # of the other samples have smaller, or larger, values on average
@@ -63,6 +64,27 @@ def beyond_the_reference(state: State, record: Record) -> Mask:
             nearest = np.minimum(np.abs(at - record.time[after - 1]), np.abs(at - record.time[after]))
             out |= nearest > UNCOVERED * step
     return out
+
+
+def before_the_play(bad: Mask, state: State) -> tuple[Mask, str]:
+    """(N,) bad samples that a survey begins with, while the play of an adopted hysteresis still shows what it began
+    with, which nobody knows, and this in words; none, and "", otherwise."""
+    x, out = state.excitation, np.zeros(len(bad), dtype=bool)
+    end = int(np.argmin(bad)) if not bad.all() else len(bad)
+    for model in state.adopted:
+        if model.name != HYSTERESIS or not end:
+            continue
+        own = [i for i, name in enumerate(x.sensors) if name in (model.sensors or x.sensors)]
+        output = x.output[:end, own].reshape(end, -1)
+        swept = np.maximum.accumulate(output) - np.minimum.accumulate(output)
+        if (swept[max(end - LONGEST_SPIKE, 0)] < 2.0 * float(model.settings["half_width_nT"])).any():
+            out[:end] = True
+    if not out.any():
+        return out, ""
+    return out, (
+        f"{end} samples at the start, in which the state that {HYSTERESIS} began with still shows, are flagged and "
+        "have no part in the calibration"
+    )
 
 
 def unread_words(state: State, record: Record) -> list[str]:

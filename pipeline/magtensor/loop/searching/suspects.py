@@ -38,18 +38,20 @@ class Suspects:
     nearest: list[str]
 
     @classmethod
-    def of(cls, found: Search, flagged: Mask, sparse: SparseReadings | None) -> Suspects:
+    def of(cls, found: Search, flagged: Mask, known: Mask, sparse: SparseReadings | None) -> Suspects:
         """Of a search that has ended.
 
         Parameters
         ----------
-        flagged: (N,) samples that no calibration fits.
+        flagged: (N,) samples that no calibration fits; known: (N,) the same of which it is known why.
         """
         last = found.steps[-1].candidates if found.steps else ()
         refused = found.steps[-1].refused if found.steps else {}
         seen = [c for c in last if c.passes or unlikely(c)]
-        if flagged.any():  # while effects were sought, what lasts was believed
+        if flagged.any() or known.any():  # while effects were sought, what lasts was believed
             seen = [c for c in seen if _still_significant(c, found.told)]
+        if known.any():
+            last = tuple(c for c in last if _still_significant(c, found.told, NEAR))
         reference = [c for c in last if c.model.component.effect == "reference"]
         noisy = {c.model.name for c in reference if refused.get(c.model.name) == NOT_AS_ASSUMED}
         if sparse is not None:
@@ -111,10 +113,10 @@ def unlikely(candidate: Candidate) -> bool:
     return max(candidate.adjusted_p, candidate.adjusted_own_p) < candidate.alpha and candidate.adjusted_null_p < ALPHA
 
 
-def _still_significant(candidate: Candidate, state: State) -> bool:
-    """Whether a model is asked for by the samples that are still in use."""
+def _still_significant(candidate: Candidate, state: State, alpha: float | None = None) -> bool:
+    """Whether a model is asked for by the samples that are still in use, at the level of the search or another."""
     terms = candidate.model.terms(state.excitation).at(state.residual.samples)
     white = Whitened.of(state.residual, state.colours.across, state.colours.along, state.terms)
     now = assess(white, terms, once=happens_once(candidate.model))
     p = max(now.p, now.own_p)
-    return p * candidate.tried < candidate.alpha and now.null_p * candidate.tried < ALPHA
+    return p * candidate.tried < (alpha or candidate.alpha) and now.null_p * candidate.tried < ALPHA

@@ -24,6 +24,7 @@ from magtensor.loop.remainder.changing_matrix import changing_matrices
 from magtensor.loop.remainder.flagged import (
     ALIKE,
     after_pauses,
+    before_the_play,
     beyond_the_reference,
     flagged_words,
     lasting,
@@ -57,8 +58,9 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
     sparse = sparse_readings(state, record)
     bad = disturbed(record, state, found.how)
     starts, paused = after_pauses(bad, state.excitation)
-    flagged = lasting(bad, beyond_the_reference(state, record)) | starts
-    suspects = Suspects.of(found, flagged, sparse)
+    played, began = before_the_play(bad, state)
+    flagged = lasting(bad, beyond_the_reference(state, record) | played) | starts
+    suspects = Suspects.of(found, flagged, played, sparse)
     words = [*_what_shows(found, record, excess, sparse), *suspects.words]
     times = _slow(state, record) / state.residual.scale
     if not words and times > NO_NOISE:
@@ -80,7 +82,7 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
         size = f"{excess:.3g} nT rms above the white noise{in_use}, {_where(state)}"
         words.insert(0, size if excess else "in sum no more than the white noise")
     beside += [sparse.words] if sparse is not None else suspects.noise_words
-    beside += suspects.small_words
+    beside += [*suspects.small_words, *([began] if began else [])]
     if record.absent:
         beside.append(f"not searched, for most of the survey lacks it: {', '.join(record.absent)}")
     if flagged.any():
