@@ -15,7 +15,7 @@ from magtensor.loop.fitting.refit import joint_state
 from magtensor.loop.fitting.trial import trial
 from magtensor.loop.searching import rivals
 from magtensor.loop.searching.gates import Candidate
-from magtensor.loop.searching.keeping import _missed_on, why_not
+from magtensor.loop.searching.keeping import missed_on, why_not
 from magtensor.loop.searching.likeness import event_along
 from magtensor.loop.searching.on_more_sensors import in_the_place_of_others, on_more_sensors
 from magtensor.loop.searching.screening import candidates_of
@@ -139,7 +139,7 @@ def test_an_effect_goes_to_the_sensors_that_show_it_and_to_no_other(warmed: Reco
 @pytest.mark.parametrize(("begun", "missed"), [(("S1", "S2"), True), (("S1", "S2", "S3"), False)])
 def test_a_sensor_that_shows_an_effect_is_not_spared_it(warmed: Record, begun: tuple[str, ...], missed: bool) -> None:
     state = joint_state(warmed, [model("temperature_offset", FOLLOWING, *begun)], Fitting())
-    assert _missed_on(state, 0, ["S3" if missed else "S4"]) == missed
+    assert missed_on(state, 0, ["S3" if missed else "S4"]) == missed
 
 
 @pytest.mark.parametrize("another", [False, True])

@@ -66,7 +66,7 @@ def fitted(record: Record, before: Trial, chosen: Candidate, how: Fitting) -> Fi
             fewer = trial(record, narrowed(record, after.state, which, tuple(helped), how), how)
             before = on_the_folds_of(fewer, record, before, how)
             if not before.hurt_by(fewer):
-                if not _missed_on(fewer.state, which, hurt):
+                if not missed_on(fewer.state, which, hurt):
                     after = fewer
                 hurt = []
     if hurt:
@@ -74,7 +74,7 @@ def fitted(record: Record, before: Trial, chosen: Candidate, how: Fitting) -> Fi
     return Fitted(after, why_not(record, before, after, chosen, how))
 
 
-def _missed_on(state: State, which: int, sensors: Sequence[str]) -> bool:
+def missed_on(state: State, which: int, sensors: Sequence[str]) -> bool:
     """Whether one of the models, taken off some sensors, would predict held-out blocks on them: their |b| - F is worse
     with it by something slow, as an error of the base station is, and all that is known of them is not."""
     own = replace(state.adopted[which], sensors=tuple(sensors)).terms(state.excitation).at(state.residual.samples)
