@@ -46,7 +46,7 @@ def as_dated_here(
     model, theta = own[number]
     if model.start is None:
         return model
-    here = _shown(record, calibration, own, model, good)
+    here = _shown(record, calibration, model, good)
     if here is None:
         return model
     dated, left = here.added(model, theta), here.left(own)
@@ -61,18 +61,14 @@ def as_dated_here(
 
 
 def _shown(
-    record: Record,
-    calibration: ArrayCalibration,
-    own: Sequence[tuple[Adopted, Array]],
-    model: Adopted,
-    good: NDArray[np.bool_],
+    record: Record, calibration: ArrayCalibration, model: Adopted, good: NDArray[np.bool_]
 ) -> Here | _Lengths | None:
     """Where an effect shows on a survey; None where it does not."""
     if model.component.effect == "instrument" and shows_a_state(record.raw, record.position is not None):
         return Here.of(record, calibration)
     if record.total_field is None:
         return None
-    lengths = _Lengths.of(record, calibration, record.total_field, own, good)
+    lengths = _Lengths.of(record, calibration, record.total_field, good)
     return lengths if len(lengths.use) else None
 
 
@@ -96,14 +92,7 @@ class _Lengths:
     offsets: list[Array]
 
     @classmethod
-    def of(
-        cls,
-        record: Record,
-        calibration: ArrayCalibration,
-        total_field: Array,
-        own: Sequence[tuple[Adopted, Array]],
-        good: NDArray[np.bool_],
-    ) -> _Lengths:
+    def of(cls, record: Record, calibration: ArrayCalibration, total_field: Array, good: NDArray[np.bool_]) -> _Lengths:
         usable = np.asarray(np.isfinite(record.raw).all(axis=(1, 2)))
         b = calibration.apply(np.where(usable[:, None, None], record.raw, 0.0))
         forward = np.asarray(np.linalg.inv(calibration.matrix), dtype=float)
