@@ -146,6 +146,21 @@ def test_what_dies_away_is_no_response_to_the_temperature_that_began_with_it(see
     assert adopted["settings"]["tau_s"] == pytest.approx(150.0, rel=0.1)
 
 
+def test_a_start_of_another_form_is_no_response_to_a_board_that_warms_up(tmp_path: Path) -> None:
+    """What dies away from a free beginning and the course of a board that warms up together bend like a bump."""
+    path = survey_file(tmp_path, scenario(21), "bump.h5")
+    per_nT = np.zeros((4, 3))
+    per_nT[[1, 3]] = [[3.0, 1.6, 3.4], [3.6, -2.8, -2.0]]
+    with h5py.File(path, "a") as file:
+        since = file["time"][:] - file["time"][0]
+        scale_s = since[-1] / 15.0
+        file["temperature"][:] = 35.0 - 12.0 * np.exp(-since / (4.0 * scale_s))
+        bump = since / scale_s * np.exp(1.0 - since / scale_s)
+        file["b_raw"][:] = file["b_raw"][:] + bump[:, None, None] * per_nT
+    told = close_loop(path, search=["temperature_offset", "temperature_rate", "warm_up", "offset_drift"]).verdict
+    assert not told["adopted"] and told["unexplained"]["present"]
+
+
 @pytest.mark.parametrize(("part", "limit"), [(1.0, True), (-1.0, True), (0.9, False), (0.0, False)])
 def test_a_beginning_at_its_limit_is_none(part: float, limit: bool, tmp_path: Path) -> None:
     x = linear_state(loaded(tmp_path, scenario(65))).excitation

@@ -142,12 +142,12 @@ def assess(now: Whitened, terms: Terms, *, once: bool = False, noise: OwnNoise |
     p = own_p if once else by_blocks
     gain = held_out_gain(blocks, residual.freedom, blocked, parts)
     focused = focused_gain(blocks, residual.freedom, blocked)
-    left = _left_there(residual, together, best.theta, first, parts)
+    left = left_there(residual, together, best.theta, first, parts)
     evidence = (parts, gain, null_gain, focused, null_focused, p, own_p, null_p, left)
     return Assessment(_estimate(blocks), *evidence, colours, best.theta)
 
 
-def _left_there(residual: Residual, terms: Terms, theta: Array, given: int, parts: Blocks) -> float:
+def left_there(residual: Residual, terms: Terms, theta: Array, given: int, parts: Blocks) -> float:
     """What of something that is over soon is left at its time by all terms but the first `given` ones; 0 of what is
     not."""
     if parts.divided == (0, 0):

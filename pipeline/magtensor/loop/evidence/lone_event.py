@@ -16,6 +16,7 @@ from magtensor.calibration.types import Array
 from magtensor.loop.evidence.folds import Blocks
 from magtensor.loop.evidence.residual import Residual
 
+MOST_LEFT = 0.1  # of the square of what there was, when something happened once: a third of its size
 ACTS = 0.1  # of what a model explains: a sensor with less hardly shows it
 CHANCE = 3.0  # standard deviations of a sum of squares of noise
 CORE = 0.05  # of what is known of it lies before the core, and as much after

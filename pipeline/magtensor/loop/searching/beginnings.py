@@ -12,9 +12,11 @@ from magtensor.components import Component
 from magtensor.error_models.excitation import Excitation
 from magtensor.error_models.settings import AnyChannel, Beginning, Orders, profiled
 from magtensor.error_models.terms import Terms, joined
-from magtensor.loop.evidence.assessment import WHITE, assess, colours_of, estimated_in, likeliest
+from magtensor.loop.evidence.assessment import WHITE, assess, colours_of, estimated_in, left_there, likeliest
+from magtensor.loop.evidence.folds import Blocks
 from magtensor.loop.evidence.golden import golden
 from magtensor.loop.evidence.grams import Whitened
+from magtensor.loop.evidence.lone_event import MOST_LEFT
 from magtensor.loop.evidence.residual import Residual
 from magtensor.loop.evidence.scoring import Scorer
 from magtensor.loop.fitting.model import Adopted, State, generic, regressors
@@ -182,7 +184,10 @@ def begun(
     if fair(terms(best)) <= max(fair(terms(settings)), fair(dying)) + least_gain(names):
         return settings
     settled = terms({**best, **dict.fromkeys(names, 0.0)})
-    if generic(Adopted(model, best)) and not _seen_beside(dying, settled, few):
+    if _seen_beside(dying, settled, few):
+        return best
+    here = what_dies_away(terms, best, names, widest)
+    if generic(Adopted(model, best)) or _left_at_the_start(terms(best), here, few) > MOST_LEFT:
         return settings
     return best
 
@@ -200,6 +205,14 @@ def _seen_beside(alone: Terms, settled: Terms, few: tuple[Residual, Terms | None
     colours = likeliest(residual, beside, [colours_of(residual), WHITE]).colours
     found = assess(Whitened.of(residual, colours.across, colours.along, beside), settled)
     return found.p < _ALONE and found.gain.consistent
+
+
+def _left_at_the_start(began: Terms, dying: Terms, few: tuple[Residual, Terms | None]) -> float:
+    """The part that a response leaves of what there is while that dies away which it began with; 0 where that lasts."""
+    residual, given = few
+    together = began if given is None else joined([given, began])
+    theta = likeliest(residual, together, [colours_of(residual), WHITE]).theta
+    return left_there(residual, together, theta, together.count - began.count, Blocks.of_an_event(dying))
 
 
 def least_gain(names: Sequence[str]) -> float:

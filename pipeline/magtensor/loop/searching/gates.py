@@ -11,6 +11,7 @@ from magtensor.calibration.types import Array
 from magtensor.error_models.settings import AnyChannel, profiled
 from magtensor.error_models.terms import Terms, joined
 from magtensor.loop.evidence.assessment import BORNE_OUT, Assessment
+from magtensor.loop.evidence.lone_event import MOST_LEFT
 from magtensor.loop.evidence.residual import Residual, taken_off
 from magtensor.loop.fitting.model import Adopted, State
 from magtensor.loop.searching.contribution import a_tone, happens_once
@@ -19,7 +20,6 @@ ALPHA = 0.005  # family-wise probability that a clean survey gets an adoption, b
 SECOND_ORDER = 1e-5  # of the sum of squares that is explained: 0.3 % of an effect's size
 OF_THE_LAW = 0.0025  # the same, that the law of an effect may miss: 5 % of its size
 LEAST_REDUCTION = 1e-4  # of the held-out sum of squares: smaller is significant only in very long surveys
-MOST_LEFT = 0.1  # of the square of what there was, when something happened once: a third of its size
 UNEVENLY = 1.0  # paired t: one standard deviation; what predicts nothing has as much one time in six
 MUCH = 0.1  # of the held-out sum of squares: no noise of a clean survey is predicted so well
 LOG_MARGIN = 1.5  # the noise of a log is known to some per cent
