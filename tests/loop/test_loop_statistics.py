@@ -85,6 +85,7 @@ def test_combined_probability() -> None:
     assert cauchy_combination([0.03, 0.03, 0.03]) == pytest.approx(0.03, rel=1e-9)
     assert cauchy_combination([1e-9, 0.5, 0.4, 0.7]) == pytest.approx(4e-9, rel=0.01)  # Bonferroni's for one small p
     assert 0 < cauchy_combination([1e-250, 0.9]) < 1e-200
+    assert cauchy_combination([1e-6, 1.0, 1.0]) < 1e-5  # what sees nothing does not outweigh what does
     draws = np.random.default_rng(5).uniform(size=(4000, 5))
     assert kstest([cauchy_combination(row) for row in draws], "uniform").pvalue > 0.001
 

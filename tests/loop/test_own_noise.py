@@ -272,3 +272,18 @@ def test_beside_series_that_take_all_of_the_lowest_octaves(samples: int, sensors
     taken = [replace(drift, series=np.cos(np.pi * k * time)[:, None]) for k in range(1, given + 1)]
     p = OwnNoise(state.residual, joined(taken).at(all_of_them)).p_value(drift.at(all_of_them))
     assert 0.01 < p <= 1.0
+
+
+@pytest.mark.parametrize("step_nT", [0.0, 0.3])
+def test_a_sensor_that_jumps_when_the_base_station_does(step_nT: float) -> None:
+    """The step that is free in the reference takes nothing of what differs between the sensors."""
+    added = np.zeros((SAMPLES, 4, 3))
+    added[SAMPLES // 2 :, 0] = step_nT * np.array([0.0, 0.74, -0.67])
+    state = linear_state(synthetic(31, SAMPLES, turning_s=4.0, noise_nT=0.2, added=added))
+    x, every = state.excitation, state.residual.samples
+    of_sensors, of_reference = (
+        Registry.load().find("error_model", name).function(x, time_s=SAMPLES // 2 * x.spacing)
+        for name in ("offset_step", "reference_step")
+    )
+    p = OwnNoise(state.residual, of_reference.at(every)).p_value(of_sensors.at(every))
+    assert p < 1e-9 if step_nT else 0.01 < p <= 1.0

@@ -198,12 +198,14 @@ class OwnNoise:
             the outputs in each.
         """
         outputs = np.concatenate([np.arange(3 * s, 3 * s + 3) for s in sensors])
+        fit = 1 + self.residual.affine.shape[1]
+        series = series[:, [*range(fit), *(fit + k for k in self._given_series_into(outputs))]]
         own = terms.part_output // 3 == sensors[0]
         into = np.zeros((terms.count, len(outputs)))
         axis = terms.part_output[own] % 3
         np.add.at(into, (terms.part_term[own], axis), terms.part_weight[own] / self.residual.noise[outputs[axis]])
         into = into[np.any(into != 0.0, axis=1)]
-        series, seen = series.copy(), np.empty((len(series), len(into)))
+        seen = np.empty((len(series), len(into)))
         plane = self.residual.basis[outputs]
         for band, power in narrow:
             weight = np.diag(1.0 / power[outputs])
@@ -221,6 +223,12 @@ class OwnNoise:
         if np.sum(column**2) <= _INNER_RANK**2 * np.sum(series[:, 0] ** 2):
             return 1.0
         return _in_octaves(column, seen, taken)
+
+    def _given_series_into(self, outputs: Array) -> list[int]:
+        """The numbers of the given terms' series that are in some outputs: one in the reference alone is not."""
+        if self.given is None:
+            return []
+        return sorted(set(self.given.part_series[np.isin(self.given.part_output, outputs)].tolist()))
 
     def slow_std(self) -> Array:
         """(3 S,) nT, rms of the slow noise of each output beside its white noise; 0 of a single sensor."""

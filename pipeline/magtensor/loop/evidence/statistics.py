@@ -12,6 +12,7 @@ from magtensor.loop.evidence.grams import Grams
 from magtensor.loop.evidence.jackknife import Jackknife
 
 BLOCK_COUNTS = (120, 30, 12)  # long blocks protect against correlation longer than a short block
+LARGE_P = 0.999  # beyond which p values count alike
 LEAST_BLOCKS = 6
 
 
@@ -83,10 +84,14 @@ def wald_p(g: Grams, chosen: Sequence[int], alone: Sequence[int] = (), most: int
 
 
 def cauchy_combination(p_values: Sequence[float]) -> float:
-    """One p value from several that may depend on each other (ACAT, Liu and Xie 2020)."""
+    """One p value from several that may depend on each other (ACAT, Liu and Xie 2020).
+
+    The tangent goes to minus infinity at 1, and one test that sees nothing would outweigh any other: all large p values
+    count alike.
+    """
     if min(p_values) >= 1.0:
         return 1.0
-    p = np.clip(np.asarray(p_values, dtype=float), 1e-300, 1 - 1e-12)
+    p = np.clip(np.asarray(p_values, dtype=float), 1e-300, LARGE_P)
     # tan(pi (1/2 - p)) is 1 / (pi p) for the smallest p, where the tangent itself overflows its accuracy
     statistic = np.mean(np.where(p < 1e-15, 1 / (np.pi * p), np.tan(np.pi * (0.5 - p))))
     if statistic > 1e15:
