@@ -6,10 +6,14 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import h5py
+import numpy as np
 import pytest
-from loop_cases import BASE, adopted_names, scenario, suspects, verdict_of
+from loop_cases import BASE, adopted_names, scenario, survey_file, suspects, verdict_of
 from scipy.stats import ncx2
 
+from magtensor import close_loop
+from magtensor.loop.fitting.log_noise import white_noise
 from magtensor.loop.searching.gates import gained_of_a_log
 
 
@@ -23,6 +27,30 @@ def test_noise_seldom_gains_more_and_an_effect_beside_it_does(log_noise: float, 
 
 def test_without_noise_nothing_is_gained() -> None:
     assert gained_of_a_log(0.0, 12) == 0.0
+
+
+def test_what_is_on_or_off_has_no_noise_and_a_coarse_reading_has() -> None:
+    run, switch = np.zeros(400, dtype=int), (np.arange(400) // 17 % 2).astype(float)
+    np.testing.assert_array_equal(white_noise(np.column_stack([switch, 3.3 * switch]), run), 0.0)
+    np.testing.assert_allclose(white_noise(21.0 + switch, run), 1.0 / np.sqrt(12.0))
+
+
+@pytest.mark.long
+def test_a_range_that_is_logged_changes_offset_and_scale_of_a_sensor(tmp_path: Path) -> None:
+    """An offset beside a scale that follows the same bit is not explained by noise of a log that has none."""
+    path = survey_file(tmp_path, scenario(72, channels={}), "ranged.h5")
+    with h5py.File(path, "a") as file:
+        raw, high = file["b_raw"][:], np.zeros(len(file["time"]))
+        for i, largest in enumerate(np.abs(raw[:, 1]).max(axis=1)):
+            high[i] = largest > 42e3 or (high[i - 1] and largest > 39e3)
+        raw[:, 1] += high[:, None] * (np.array([3.0, -2.0, 4.0]) - 3e-4 * raw[:, 1])
+        file["b_raw"][:] = raw
+        file["range_2"] = high
+        file["range_2"].attrs["units"] = "1"
+    told = close_loop(path, search=["channel_response", "nonlinearity_cubic", "hysteresis"]).verdict
+    assert {a["settings"]["times_field"] for a in told["adopted"]} == {True, False}
+    assert [(a["sensors"], a["settings"]["channel"]) for a in told["adopted"]] == 2 * [(["S2"], "range_2")]
+    assert not told["unexplained"]["present"], told["unexplained"]["description"]
 
 
 def on_a_bus(*effects: dict[str, Any], current_noise_A: float) -> dict[str, Any]:

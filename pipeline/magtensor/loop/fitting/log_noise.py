@@ -26,7 +26,8 @@ def white_noise(values: Array, run: NDArray[np.int_]) -> Array:
 
     From second differences within runs, by their median, so that jumps count as signal; less where values two apart
     differ by more than neighbours do, as those of a channel that wanders: white noise is the part that does not grow.
-    At least the noise of the resolution where the values are rounded.
+    At least the noise of the resolution where the values are rounded; what is zero or one other value is on or off, and
+    exact.
     """
     columns = values.reshape(len(values), -1)
     out = np.zeros(columns.shape[1])
@@ -39,9 +40,14 @@ def white_noise(values: Array, run: NDArray[np.int_]) -> Array:
     for j, column in enumerate(columns.T):
         steps = np.abs(np.diff(column))
         steps = steps[steps > 1e-9 * max(float(np.ptp(column)), 1e-300)]
-        if out[j] == 0 and len(steps):
+        if out[j] == 0 and len(steps) and not _on_or_off(column):
             out[j] = steps.min() / np.sqrt(12.0)
     return out
+
+
+def _on_or_off(column: Array) -> bool:
+    levels = np.unique(column)
+    return len(levels) == 2 and bool(np.any(levels == 0.0))
 
 
 def _that_does_not_grow(columns: Array, run: NDArray[np.int_]) -> Array:

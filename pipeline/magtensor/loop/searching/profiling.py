@@ -12,7 +12,7 @@ import numpy as np
 from magtensor.calibration.types import Array
 from magtensor.components import Component
 from magtensor.error_models.excitation import Excitation
-from magtensor.error_models.settings import AnyChannel, Beginning, EventTimes, Frequencies, Range, profiled
+from magtensor.error_models.settings import AnyChannel, Beginning, Choice, EventTimes, Frequencies, Range, profiled
 from magtensor.error_models.terms import Terms
 from magtensor.errors import UsageError
 from magtensor.loop.evidence.assessment import WHITE, colours_of
@@ -65,15 +65,16 @@ def short_parts(model: Component, grid: Sequence[dict[str, Any]], x: Excitation)
 
 
 def already(adopted: Iterable[Adopted], model: Component, settings: Mapping[str, Any]) -> bool:
-    """Whether a model is in already with the same channel, and settings on ranges so near that the two could not be
-    told apart."""
+    """Whether a model is in already with the same channel, acting on the same, and settings on ranges so near that the
+    two could not be told apart."""
     grids = profiled(model)
     channels = {n for n, g in grids.items() if isinstance(g, AnyChannel)}
+    acts_on = {n for n, g in grids.items() if type(g) is Choice and g.options == (False, True)}
     ranges = {n for n, g in grids.items() if of_ratios(g)}
     begun = {n for n, g in grids.items() if isinstance(g, Beginning)}
-    same = channels or set(grids) - ranges - begun
+    same = channels | acts_on if channels else set(grids) - ranges - begun
     return any(
-        all(one.settings.get(n) == settings.get(n) for n in same)
+        all(one.settings.get(n, model.parameters[n].default) == settings.get(n) for n in same)
         and not any(_apart(one.settings.get(n, model.parameters[n].default), settings[n]) for n in ranges)
         for one in adopted
         if one.name == model.name
