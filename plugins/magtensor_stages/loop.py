@@ -128,7 +128,7 @@ def close_loop(
     outcome |= {"unexplained": left, "held_out": {"before": before, "after": after}}
     if doubt is not None:
         outcome["calibration"] = doubt.facts()
-    undisturbed = np.array(survey.good)
+    undisturbed = np.array(survey.readings)
     undisturbed[record.samples[~last.fit.keep]] = False
     clean = cleaned(survey, calibration, last.adopted, last.theta, record.origins, undisturbed)
     believed = np.zeros(len(survey.time), dtype=bool)

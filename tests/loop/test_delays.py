@@ -6,6 +6,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import pytest
 from loop_cases import adopted_names, scenario, survey_file, verdict_of
@@ -96,6 +97,27 @@ def test_a_second_survey_is_brought_back_to_its_time(tmp_path: Path) -> None:
     assert np.isnan(b[-1, 2]).all() and np.isfinite(b[:-1]).all()
     errors = np.linalg.norm(b, axis=2) - np.linalg.norm(true.truth.b, axis=-1).reshape(len(b), -1)
     assert np.sqrt(np.nanmean(errors**2, axis=0)).max() < 1.2 * NOISE_NT  # and what C and o are known to
+
+
+@pytest.mark.long
+def test_rows_that_repeat_a_reading_are_none_to_interpolate_from(tmp_path: Path) -> None:
+    effect = late(0.0, 0.003, 0.0, 0.0)
+    first, second = (
+        survey_file(tmp_path, scenario(seed, effect, motion=HAND, rate_Hz=10.0, truth=True), f"{seed}.h5")
+        for seed in (3, 4)
+    )
+    for path in (first, second):
+        with h5py.File(path, "a") as file:
+            raw = file["b_raw"][:]
+            for row in np.flatnonzero(np.random.default_rng(5).random(len(raw)) < 0.25):
+                raw[row] = raw[max(row - 1, 0)]
+            file["b_raw"][:] = raw
+            true, fresh = np.linalg.norm(file["truth/b_true"][:], axis=-1), np.any(np.diff(raw, axis=0), axis=(1, 2))
+    found = magtensor.close_loop(first, search=["sampling_lag", "bandwidth"])
+    assert adopted_names(found.verdict) == {"sampling_lag"}
+    b = found.calibration.apply(second)["calibrated/b"].to_numpy()
+    errors = (np.linalg.norm(b, axis=2) - true)[1:][fresh]
+    assert np.sqrt(np.nanmean(errors**2, axis=0)).max() < 1.2 * NOISE_NT
 
 
 @pytest.mark.long

@@ -265,7 +265,7 @@ def cleaned(
     """The survey with the adopted effects taken off `b_raw` and `total_field`.
 
     Args:
-        good: (N,) samples in whose field error models may look; the survey's own if None.
+        good: (N,) samples in whose field error models may look; the readings of the survey if None.
 
     Raises:
         DataError: the survey lacks a channel that an effect follows.
@@ -283,7 +283,7 @@ def cleaned(
                 "apply a calibration without this effect, or log what it follows",
             )
     try:
-        raw = corrected_raw(record, calibration, adopted, theta, survey.good if good is None else good)
+        raw = corrected_raw(record, calibration, adopted, theta, survey.readings if good is None else good)
         field = corrected_reference(record, adopted, theta)
     except (KeyError, ValueError) as error:
         names = ", ".join(a.name for a in adopted)
