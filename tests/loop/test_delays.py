@@ -82,6 +82,14 @@ def test_delays_of_sensors_are_found_to_all_orders(tmp_path: Path, rate_Hz: floa
     assert told["adopted"][0]["evidence"]["held_out_rms_after_nT"] < 1.3 * NOISE_NT
 
 
+def test_of_two_sensors_one_that_is_late_is_told_from_one_that_is_filtered(tmp_path: Path) -> None:
+    """Before a delay is fitted the noise of two sensors seems larger, and models are compared across that."""
+    pair = scenario(6, late(0.0, 0.006))
+    pair["instrument"] = pair["instrument"] | {"array": {"positions_m": [[0.25, 0.0, 0.0], [-0.25, 0.0, 0.0]]}}
+    told = verdict_of(tmp_path, pair, models=["sampling_lag", "bandwidth", "eddy_current"])
+    assert adopted_names(told) == {"sampling_lag"}
+
+
 @pytest.mark.long
 def test_a_second_survey_is_brought_back_to_its_time(tmp_path: Path) -> None:
     """As if nothing were late, but for the last sample, which has not been recorded."""

@@ -29,18 +29,25 @@ _ROUNDS = 3  # the colour depends on the coefficients and they on it; after thre
 
 @dataclass(frozen=True)
 class Colours:
-    """The colours of the two parts of a residual."""
+    """The colours of the two parts of a residual.
+
+    Attributes:
+        scale: nT, that a value of one in that residual stands for; None of noise that is white in any.
+    """
 
     across: Colour
     along: Colour | TurnedColour
+    scale: float | None = None
 
     def among(self, residual: Residual) -> Colours:
-        """The same at the samples of a residual, which may be more or fewer."""
+        """The same of a residual, which may have more samples or fewer, and be divided by other noise."""
         samples, along = len(residual.affine), self.along
         if isinstance(along, Colour):
-            return Colours(self.across.among(samples), along.among(samples))
-        same = len(along.modes.response) == samples
-        return Colours(self.across.among(samples), along if same else along.among(residual.slow_modes))
+            along = along.among(samples)
+        elif len(along.modes.response) != samples:
+            along = along.among(residual.slow_modes)
+        louder = 1.0 if self.scale is None else (self.scale / residual.scale) ** 2
+        return Colours(self.across.among(samples).louder(louder), along.louder(louder), residual.scale)
 
 
 WHITE = Colours(Colour(None, 1.0), Colour(None, 1.0))
@@ -51,7 +58,8 @@ def colours_of(residual: Residual, *, stiff: bool = False, above: int = 1) -> Co
     white = Colour(None, 1.0)
     size = len(residual.noise)
     across = colour_of(residual.across, size - 3, stiff=stiff, above=above) if residual.across is not None else white
-    return Colours(across, white if residual.along is None else _along(residual, residual.along, across, stiff))
+    along = white if residual.along is None else _along(residual, residual.along, across, stiff)
+    return Colours(across, along, residual.scale)
 
 
 def _along(residual: Residual, along: Array, across: Colour, stiff: bool) -> Colour | TurnedColour:
@@ -131,7 +139,7 @@ def assess(now: Whitened, terms: Terms, *, once: bool = False, noise: OwnNoise |
     null = grams_in(now, terms, parts.edges)
     null_gain = held_out_gain(null, residual.freedom, blocked, parts)
     null_focused = focused_gain(null, residual.freedom, blocked)
-    best = likeliest(residual, together, [Colours(now.across, now.along), WHITE], _estimate(null).theta)
+    best = likeliest(residual, together, [Colours(now.across, now.along, residual.scale), WHITE], _estimate(null).theta)
     colours = best.colours
     sensor = _only_sensor(null, first, terms)
     stronger = slow_noise_of(sensor, taken_off(residual, together, best.theta), now.across)

@@ -50,6 +50,10 @@ class Colour:
         own = np.arange(len(self.power)) / len(self.power)
         return replace(self, power=np.interp(np.arange(samples) / samples, own, self.power))
 
+    def louder(self, times: float) -> Colour:
+        """The same of noise with so many times the power."""
+        return self if times == 1.0 else replace(self, white=self.white * times)
+
     def log_volume(self, count: int) -> float:
         """The sum of the logarithms of the spectrum, for a series of so many samples."""
         spread = 0.0 if self.power is None else float(np.sum(np.log(self.power)))

@@ -121,6 +121,10 @@ class TurnedColour:
         modes = modes.slowest(len(self.variance) // 3)
         return TurnedColour(modes, self.variance[: 3 * modes.most], self.rest.among(len(modes.response)))
 
+    def louder(self, times: float) -> TurnedColour:
+        """The same of noise with so many times the power."""
+        return self if times == 1.0 else replace(self, rest=self.rest.louder(times))
+
     @property
     def white(self) -> float:
         """The white level."""

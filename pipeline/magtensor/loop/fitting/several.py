@@ -191,7 +191,8 @@ def _beside_what_is_free(colours: Colours, residual: Residual, coefficients: int
     more = _more(samples, 6 + 3 * (own - 3) + constants + share)
     rest = colours.along.rest if isinstance(colours.along, TurnedColour) else colours.along
     rest = replace(rest, white=rest.white * more)
-    return Colours(across, replace(colours.along, rest=rest) if isinstance(colours.along, TurnedColour) else rest)
+    along = replace(colours.along, rest=rest) if isinstance(colours.along, TurnedColour) else rest
+    return replace(colours, across=across, along=along)
 
 
 def _more(samples: int, free: float) -> float:

@@ -158,7 +158,7 @@ def _as_likely(best: Candidate, other: Candidate, state: State) -> bool:
     def whole(c: Candidate) -> float:
         before = c.before or state
         together = c.terms if before.terms is None else joined([before.terms, c.terms])
-        return explained(estimated(before.residual, together, best.assessment.colours))
+        return explained(estimated(before.residual, together, best.assessment.colours.among(before.residual)))
 
     return whole(best) - whole(other) < SEPARATION
 
