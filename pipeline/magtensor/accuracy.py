@@ -53,6 +53,27 @@ def error_block(
     return block | {"samples": int(use.sum())}
 
 
+def left_by_any_calibration(b: Array, total_field: Array, good: np.ndarray) -> float | None:
+    """nT rms of |b| - F that no other offsets and matrix of each sensor would take off, to first order; None of nothing.
+
+    A survey that disagrees with a calibration for what this leaves has noise or a disturbance of its own.
+
+    Args:
+        b: (N, S, 3) nT calibrated; total_field: (N,) nT; good: (N, S) samples in use.
+    """
+    left = []
+    for sensor in range(b.shape[1]):
+        own, residual = b[:, sensor], np.linalg.norm(b[:, sensor], axis=1) - total_field
+        use = good[:, sensor] & np.isfinite(residual)
+        unit = own[use] / np.linalg.norm(own[use], axis=1, keepdims=True)
+        products = [unit[:, i] * unit[:, j] for i in range(3) for j in range(i, 3)]
+        columns = np.column_stack([unit, *products])
+        if len(columns) > columns.shape[1]:
+            free = np.linalg.lstsq(columns, residual[use], rcond=1e-9)[0]
+            left.append(residual[use] - columns @ free)
+    return rms(np.concatenate(left)) if left else None
+
+
 def rms(values: Array) -> float | None:
     """Root mean square; None of nothing."""
     return float(np.sqrt(np.mean(np.square(values)))) if values.size else None

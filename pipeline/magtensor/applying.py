@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from magtensor import provenance, result
-from magtensor.accuracy import figure
+from magtensor.accuracy import figure, left_by_any_calibration
 from magtensor.atomic import refuse_overwriting, require_writable
 from magtensor.errors import DataError, UsageError
 from magtensor.preparing import load_as
@@ -299,7 +299,8 @@ def verification(calibrated: Survey, path: Path | Held, planned: Plan) -> dict[s
     """The error blocks of another survey: with the declared model alone, and with all that was adopted.
 
     `total_field_as_read` names errors of the base station that were left in (`_better_as_read`), `contradicted` effects
-    without which |b| would be nearer to the survey's total field.
+    without which |b| would be nearer to the survey's total field, and `left_by_any_calibration_nT` is what of |b| - F no
+    other calibration of the sensors would take off.
     """
     corrected = apply_to(calibrated, path, planned, uniform=True)
     after = survey_block(corrected)
@@ -308,6 +309,9 @@ def verification(calibrated: Survey, path: Path | Held, planned: Plan) -> dict[s
         alone = apply_to(with_declared_alone(calibrated), path, planned, judge=False)
         before = survey_block(alone.merged({"good": corrected["good"]}))  # the same samples
     found: dict[str, Any] = {"before": before, "after": after}
+    if "total_field" in corrected:
+        each = corrected.values("calibrated/b"), corrected.values("total_field"), corrected.good_by_sensor
+        found["left_by_any_calibration_nT"] = left_by_any_calibration(*each)
     attributes = corrected["calibrated/b"].attrs
     told = ("not_taken_off", "total_field_as_read", "contradicted")
     return found | {name: attributes[name] for name in told if name in attributes}

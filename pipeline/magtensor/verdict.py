@@ -147,6 +147,12 @@ def _disagreement(outcome: dict[str, Any]) -> str:
         return f"; what was added makes the verification survey worse{what}: it does not carry over"
     if contradicted:
         return f"; |b| would be nearer to the verification survey's total field without {contradicted}"
+    left = verify.get("left_by_any_calibration_nT")
+    if apart and left is not None and left > DISAGREES * here["all"]:
+        return (
+            f"; the verification survey has {figure(left)} nT rms of |b| - F that no calibration would take off: noise or "
+            "disturbances of its own"
+        )
     if apart:
         return (
             "; the verification survey disagrees with the calibration: something changed between the two, or the first "

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import h5py
+import numpy as np
 import pytest
 
 from magtensor import close_loop, provenance
@@ -204,3 +205,20 @@ def test_an_error_of_the_base_station_that_has_ended_is_not_taken_off(tmp_path: 
     for one in (right, too):
         nT = float(one.sentence.split("|b| - F: ")[1].split()[0])
         assert nT == pytest.approx(0.2, abs=0.06)
+
+
+@pytest.mark.parametrize(("change", "told"), [("noise", "noise or disturbances of its own"), ("offset", "changed")])
+def test_a_survey_that_disagrees_says_whether_a_calibration_is_why(
+    change: str, told: str, surveys: Path, tmp_path: Path
+) -> None:
+    other = tmp_path / "other.h5"
+    shutil.copy(surveys / "verify.h5", other)
+    with h5py.File(other, "a") as file:
+        raw = file["b_raw"][:]
+        raw += 3.0 * np.random.default_rng(1).standard_normal(raw.shape) if change == "noise" else 5.0
+        file["b_raw"][:] = raw
+    found = close_loop(surveys / "survey.h5", search=[], verify=other).verdict
+    error = found["error"]["verify"]
+    assert error["after"]["total_field_rms_nT"]["all"] > 2.0
+    assert error["left_by_any_calibration_nT"] == pytest.approx(3.0 if change == "noise" else 0.2, rel=0.15)
+    assert told in sentence(found)
