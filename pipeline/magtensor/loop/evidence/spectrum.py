@@ -9,6 +9,8 @@ from magtensor.loop.evidence.colour import beside_the_field
 from magtensor.loop.evidence.residual import Residual
 
 MOST_MISSING = 0.25  # of the samples of an even grid
+_OF_A_MEDIAN = 2.0 / np.pi  # of what a mean of as many values tells
+_LEAST_VARIANCE = 1e-6  # of the largest, of the noise of a coordinate
 
 
 def spectral_lines(residual: Residual, time: Array, most: int = 5) -> list[tuple[float, float, float]]:
@@ -20,7 +22,7 @@ def spectral_lines(residual: Residual, time: Array, most: int = 5) -> list[tuple
     missing from an even grid, no more than a quarter, are interpolated.
     """
     from scipy.fft import rfft
-    from scipy.special import chdtrc, chdtri
+    from scipy.special import chdtri, fdtrc
 
     if len(time) < 256 or residual.across is None:
         return []
@@ -36,12 +38,14 @@ def spectral_lines(residual: Residual, time: Array, most: int = 5) -> list[tuple
         coordinates = np.column_stack([np.interp(grid, places, column) for column in coordinates.T])
     n, k = coordinates.shape
     # without the highest frequency of an even number of samples, which has one phase and not two
-    power = np.sum(np.abs(rfft(coordinates, axis=0)) ** 2, axis=1)[1 : (n + 1) // 2] / n
+    spectrum = rfft(coordinates, axis=0)[1 : (n + 1) // 2]
+    power = np.sum(np.abs(spectrum @ _alike(coordinates)) ** 2, axis=1) / n
     frequency = np.arange(1, len(power) + 1) / (n * step)
     width = max(len(power) // 100, 15)
     smooth = _running_median(power, width)
     ratio = power / np.maximum(smooth, 1e-300) * chdtri(2 * k, 0.5) / 2.0  # to the scale of k exponentials' sum
     ratio[: 2 * width] = 0.0
+    known_from = 2 * k * _OF_A_MEDIAN * (2 * width + 1)
     order = np.argsort(-ratio)
     peaks: list[tuple[float, float, float]] = []
     for i in order:
@@ -49,10 +53,20 @@ def spectral_lines(residual: Residual, time: Array, most: int = 5) -> list[tuple
             break
         if any(abs(frequency[i] - f) < 3.0 / (n * step) for f, _, _ in peaks):
             continue
-        p = min(1.0, float(chdtrc(2 * k, 2.0 * ratio[i])) * len(power))
-        amplitude = float(np.sqrt(2.0 * power[i] / n / k) * residual.scale)
+        p = min(1.0, float(fdtrc(2 * k, known_from, ratio[i] / k)) * len(power))
+        amplitude = float(np.sqrt(2.0 * np.sum(np.abs(spectrum[i]) ** 2) / k) / n * residual.scale)
         peaks.append((float(frequency[i]), amplitude, p))
     return peaks
+
+
+def _alike(coordinates: Array) -> Array:
+    """(K, K) what makes the fast noise of coordinates (N, K) independent and alike, its mean variance kept: the largest
+    of sums of K squares is no line where one axis, louder than all others, makes nearly all of each sum."""
+    fast = np.diff(coordinates, n=2, axis=0)
+    variance, axes = np.linalg.eigh(fast.T @ fast / len(fast))
+    least = np.maximum(variance, _LEAST_VARIANCE * variance[-1])
+    out: Array = axes / np.sqrt(least) * np.sqrt(variance.mean())
+    return out
 
 
 def _running_median(values: Array, width: int) -> Array:
