@@ -54,7 +54,7 @@ def error_block(
 
 
 def left_by_any_calibration(b: Array, total_field: Array, good: np.ndarray) -> float | None:
-    """nT rms of |b| - F that no other offsets and matrix of each sensor would take off, to first order; None of nothing.
+    """nT rms of |b| - F that no other offsets and matrices of the sensors take off, to first order; None of nothing.
 
     A survey that disagrees with a calibration for what this leaves has noise or a disturbance of its own.
 

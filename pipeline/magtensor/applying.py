@@ -299,8 +299,8 @@ def verification(calibrated: Survey, path: Path | Held, planned: Plan) -> dict[s
     """The error blocks of another survey: with the declared model alone, and with all that was adopted.
 
     `total_field_as_read` names errors of the base station that were left in (`_better_as_read`), `contradicted` effects
-    without which |b| would be nearer to the survey's total field, and `left_by_any_calibration_nT` is what of |b| - F no
-    other calibration of the sensors would take off.
+    without which |b| would be nearer to the survey's total field, and `left_by_any_calibration_nT` is what of |b| - F
+    no other calibration of the sensors would take off.
     """
     corrected = apply_to(calibrated, path, planned, uniform=True)
     after = survey_block(corrected)

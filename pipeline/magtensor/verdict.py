@@ -150,8 +150,8 @@ def _disagreement(outcome: dict[str, Any]) -> str:
     left = verify.get("left_by_any_calibration_nT")
     if apart and left is not None and left > DISAGREES * here["all"]:
         return (
-            f"; the verification survey has {figure(left)} nT rms of |b| - F that no calibration would take off: noise or "
-            "disturbances of its own"
+            f"; the verification survey has {figure(left)} nT rms of |b| - F that no calibration would take off: noise "
+            "or disturbances of its own"
         )
     if apart:
         return (

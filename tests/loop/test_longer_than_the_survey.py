@@ -10,6 +10,8 @@ from loop_cases import linear_state, synthetic
 
 from magtensor.error_models import first_order
 from magtensor.loop.searching import rivals
+from magtensor.loop.searching.by_hand import candidate
+from magtensor.loop.searching.course_of_time import beside_time
 from magtensor.loop.searching.gates import ALPHA
 from magtensor.loop.searching.rivals import hardly_begun, simplest, still_settling
 from magtensor.loop.searching.rounds import with_lines
@@ -63,3 +65,25 @@ def test_what_settles_as_slowly_as_the_survey_lasts_is_a_drift(
     chosen, others = simplest(settling, found, state)
     assert {chosen.model.name, *others} == {"warm_up", "offset_drift"}
     assert chosen.model.name == ("offset_drift" if drift else "warm_up")
+
+
+def test_a_channel_that_shows_nothing_beside_courses_of_time_is_a_drift_through_such_a_lag() -> None:
+    """A thermometer that rose soon after the start, and offsets that drift: through a lag of four surveys what it shows
+    is a straight line."""
+    elapsed = np.arange(SAMPLES, dtype=float)
+    vectors = 0.6 * np.random.default_rng(4).standard_normal((4, 3))
+    temperature = 22.0 - 2.0 * np.exp(-elapsed / 10.0)
+    added = (elapsed / SAMPLES)[:, None, None] * vectors
+    record = replace(
+        synthetic(6, SAMPLES, noise_nT=0.15, turning_s=4.0, added=added),
+        logged={"temperature": temperature - temperature.mean()}, units={"temperature": "degC"},
+        origins={"temperature": np.asarray(temperature.mean())},
+    )  # fmt: skip
+    state = with_lines(linear_state(record), record)
+    model = Registry.load().find("error_model", "temperature_offset")
+    settings = {"order": 1, "channel": "temperature", "lag_s": 4.0 * SAMPLES}
+    slow = candidate(model, settings, state, 30, ALPHA)
+    slow = replace(slow, model=replace(slow.model, component=model))  # its settings are open again
+    assert slow.passes and hardly_begun(slow.model, state.excitation)
+    told = beside_time(slow, state)
+    assert not told.seen and "a drift like any other" in told.refused

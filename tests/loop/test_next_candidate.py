@@ -144,6 +144,7 @@ def test_what_another_width_of_an_adopted_law_explains_is_no_other_effect(
     monkeypatch.setattr(rounds, "rate_instead", lambda *_: "")
     monkeypatch.setattr(rounds, "hindered_by_another", lambda *_: None)
     monkeypatch.setattr(rounds, "as_predictive", lambda *_: set())
+    monkeypatch.setattr(rounds, "by_a_worse_log", lambda *_: set())
     monkeypatch.setattr(rounds, "part_of_a_larger_law", lambda *_: "")
     monkeypatch.setattr(rounds, "part_of_a_gradient", lambda *_: "")
     monkeypatch.setattr(rounds, "part_of_a_drift", lambda *_: "")
@@ -185,6 +186,7 @@ def test_of_one_name_the_curve_of_another_channel_is_still_tried(monkeypatch: py
         "rate_instead": lambda *_: "",
         "hindered_by_another": lambda *_: None,
         "as_predictive": lambda *_: set(),
+        "by_a_worse_log": lambda *_: set(),
         "beside_time": lambda *_: BesideTime(True),
         "_outdone": lambda chosen, _: "wind" if chosen is line else "",
         "by_any_law_of": curves,

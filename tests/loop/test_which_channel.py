@@ -76,3 +76,28 @@ def test_channels_are_compared_beside_one_fit(record: Record) -> None:
     half = replace(state, residual=replace(left, across=0.5 * left.across, along=0.5 * left.along))
     chosen, others = nearest(replace(following("temperature", state), before=half), state, 30)
     assert chosen.model.settings["channel"] == "temperature" and others == ("temperature_air",)
+
+
+@pytest.mark.parametrize(("noise_degC", "another_course", "named"), [(0.3, 0.0, True), (0.02, 0.6, False)])
+def test_a_channel_of_another_name_is_named_where_the_noise_of_its_log_is_all_that_it_is_behind_by(
+    noise_degC: float, another_course: float, named: bool, record: Record
+) -> None:
+    one = record.logged["temperature"].mean(axis=1)
+    rng = np.random.default_rng(4)
+    wander = np.cumsum(rng.standard_normal(len(one)))
+    other = one + noise_degC * rng.standard_normal(len(one)) + another_course * wander / wander.std()
+    alone = {k: v for k, v in record.logged.items() if k != "temperature"} | {"temperature": one, "load": other}
+    channels = {"load": np.asarray(0.0)}
+    state = linear_state(
+        replace(
+            record,
+            logged=alone,
+            origins={**record.origins, "temperature": np.asarray(0.0), **channels},
+            units={**record.units, "load": "1"},
+        )
+    )
+    assert abs(np.corrcoef(one, other)[0, 1]) > 0.7
+    anything = Registry.load().find("error_model", "channel_response")
+    chosen, others = nearest(following("temperature", state), state, 30, anything)
+    assert chosen.model.settings["channel"] == "temperature"
+    assert others == (("load",) if named else ())

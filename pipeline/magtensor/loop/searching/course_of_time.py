@@ -28,7 +28,7 @@ from magtensor.loop.searching.contribution import happens_once
 from magtensor.loop.searching.gates import Candidate
 from magtensor.loop.searching.kin import TIME, drivers, explained_by_courses
 from magtensor.loop.searching.profiling import REFINING_SAMPLES, thinned
-from magtensor.loop.searching.rivals import overlaps
+from magtensor.loop.searching.rivals import hardly_begun, overlaps
 
 COURSES = 8  # polynomials of the root of time, which is steep at the start: a thirtieth of the survey is resolved there
 FIRST_LEFT = 2 * COURSES  # the lowest cosine frequency at which they leave the slow noise that there is
@@ -79,6 +79,10 @@ def beside_time(candidate: Candidate, state: State) -> BesideTime:
         return BesideTime(False, f"{name} explains nothing beside smooth courses of time, and a drift is adopted")
     if _chance(explains(between, own, courses) - explains(between, own), courses.count) < MORE:
         return BesideTime(False, f"smooth courses of time explain more than {name}, and leave it nothing")
+    if name != THE_FIELD and hardly_begun(model, x):
+        return BesideTime(
+            False, f"{name}, seen through a lag of more than half of the survey, is a drift like any other"
+        )
     return BesideTime(False)
 
 

@@ -60,6 +60,20 @@ def simplest(best: Candidate, possible: Sequence[Candidate], state: State) -> tu
     return chosen, tuple(sorted({c.model.name for c in equal if c is not chosen} - {chosen.model.name}))
 
 
+def by_a_worse_log(chosen: Candidate, others: Sequence[Candidate], state: State) -> set[str]:
+    """Names of the models that have the vectors of the chosen one, and are behind it by the noise of their logs."""
+    others = [c for c in others if c.model.name != chosen.model.name]
+    if not others:
+        return set()
+    colours, parts = chosen.assessment.colours, chosen.assessment.parts
+    reference = fold_gain(chosen.before or state, colours, chosen.terms, parts=parts)
+
+    def behind(other: Candidate) -> float:
+        return reference.over(fold_gain(other.before or state, colours, other.terms, parts=parts)).total
+
+    return {c.model.name for c in others if worse_log(chosen, c, behind(c), state)}
+
+
 def containing(best: Candidate, possible: Sequence[Candidate], state: State) -> Candidate:
     """The best of the models that predict more and leave `best` nothing to predict; `best` where there is none.
 

@@ -29,6 +29,7 @@ from magtensor.loop.searching.own_fit import at_their_own_fit
 from magtensor.loop.searching.profiling import repeatable
 from magtensor.loop.searching.rivals import (
     as_predictive,
+    by_a_worse_log,
     containing,
     hindered_by_another,
     overlaps,
@@ -181,6 +182,8 @@ class Rounds:
         on held-out blocks, before it is fitted or after, may be kept with another beside it."""
         refused: dict[str, str] = {}
         asked: set[str] = set()  # channels whose curves have had their turn
+        outdone: list[Candidate] = []
+        anything = next((m for m in self.models if m.name == CHANNEL), None)
         left = list(candidates)
 
         def refuse(name: str, why: str) -> None:
@@ -202,7 +205,7 @@ class Rounds:
             if why := self.of_another(chosen, candidates, before.state):
                 refuse(chosen.model.name, why)
                 continue
-            chosen, channels = nearest(chosen, before.state, models)
+            chosen, channels = nearest(chosen, before.state, models, anything)
             for frequency in tones_of(chosen.model):
                 if channels := channels_of_the_line(before.state.excitation, frequency):
                     rivals = tuple(sorted({*rivals, CHANNEL}))
@@ -211,12 +214,14 @@ class Rounds:
                 refuse(chosen.model.name, time.refused)
                 continue
             if channel := _outdone(chosen, before.state):
+                outdone.append(chosen)
                 refuse(chosen.model.name, f"any curve of {channel} explains more")
                 if channel not in asked:
                     asked.add(channel)
                     left += by_any_law_of(channel, before.state, self.open_models(before.state), self.alpha)
                 continue
-            rivals = tuple(sorted({*rivals, *as_predictive(chosen, candidates, before.state)}))
+            alike = as_predictive(chosen, candidates, before.state) | by_a_worse_log(chosen, outdone, before.state)
+            rivals = tuple(sorted({*rivals, *alike}))
             if not time.seen:
                 rivals = tuple(sorted({*rivals, *rivals_in_time(chosen, possible, before.state)}))
             if self.say is not None:
