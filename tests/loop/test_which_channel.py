@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from loop_cases import linear_state, loaded, scenario
 
-from magtensor.loop.fitting.model import Record, State
+from magtensor.loop.fitting.model import CHANNEL, Record, State
 from magtensor.loop.searching.by_hand import candidate
 from magtensor.loop.searching.gates import ALPHA, Candidate
+from magtensor.loop.searching.rivals import by_a_worse_log
 from magtensor.loop.searching.which_channel import nearest
 from magtensor.registry import Registry
 
@@ -78,26 +79,32 @@ def test_channels_are_compared_beside_one_fit(record: Record) -> None:
     assert chosen.model.settings["channel"] == "temperature" and others == ("temperature_air",)
 
 
-@pytest.mark.parametrize(("noise_degC", "another_course", "named"), [(0.3, 0.0, True), (0.02, 0.6, False)])
-def test_a_channel_of_another_name_is_named_where_the_noise_of_its_log_is_all_that_it_is_behind_by(
-    noise_degC: float, another_course: float, named: bool, record: Record
-) -> None:
+def with_load(record: Record, noise_degC: float, another_course: float) -> State:
+    """The linear fit of the survey with one thermometer, and a channel of another name that goes as it does."""
     one = record.logged["temperature"].mean(axis=1)
     rng = np.random.default_rng(4)
     wander = np.cumsum(rng.standard_normal(len(one)))
     other = one + noise_degC * rng.standard_normal(len(one)) + another_course * wander / wander.std()
-    alone = {k: v for k, v in record.logged.items() if k != "temperature"} | {"temperature": one, "load": other}
-    channels = {"load": np.asarray(0.0)}
-    state = linear_state(
+    assert abs(np.corrcoef(one, other)[0, 1]) > 0.7
+    return linear_state(
         replace(
             record,
-            logged=alone,
-            origins={**record.origins, "temperature": np.asarray(0.0), **channels},
+            logged={**record.logged, "temperature": one, "load": other},
+            origins={**record.origins, "temperature": np.asarray(0.0), "load": np.asarray(0.0)},
             units={**record.units, "load": "1"},
         )
     )
-    assert abs(np.corrcoef(one, other)[0, 1]) > 0.7
-    anything = Registry.load().find("error_model", "channel_response")
+
+
+@pytest.mark.parametrize(("noise_degC", "another_course", "named"), [(0.3, 0.0, True), (0.02, 0.6, False)])
+def test_a_channel_of_another_name_is_named_where_the_noise_of_its_log_is_all_that_it_is_behind_by(
+    noise_degC: float, another_course: float, named: bool, record: Record
+) -> None:
+    state, anything = with_load(record, noise_degC, another_course), Registry.load().find("error_model", CHANNEL)
     chosen, others = nearest(following("temperature", state), state, 30, anything)
     assert chosen.model.settings["channel"] == "temperature"
     assert others == (("load",) if named else ())
+    behind = candidate(anything, {"channel": "load", "power": 1}, state, 30, ALPHA)
+    behind = replace(behind, model=replace(behind.model, component=anything))
+    assert by_a_worse_log(chosen, [behind], state) == ({CHANNEL} if named else set())
+    assert by_a_worse_log(chosen, [chosen], state) == set()
