@@ -73,9 +73,9 @@ def close_loop(
     from magtensor.loop.correcting.stored import LATE, cleaned, effect_variables
     from magtensor.loop.decisions import Decision, decision_of
     from magtensor.loop.evidence.own_noise import OwnNoise
+    from magtensor.loop.fitting import refit
     from magtensor.loop.fitting.errors_before_after import folds_for, held_out_error
     from magtensor.loop.fitting.model import Fitting, unread
-    from magtensor.loop.fitting.refit import disturbed, with_colour
     from magtensor.loop.inquiry import inquiry_of
     from magtensor.loop.near_nominal import doubt_of, labelled, settled
     from magtensor.loop.searching.unexplained import unexplained
@@ -113,7 +113,7 @@ def close_loop(
     after = before if same else held_out_error(seen, found.last.adopted, how, found.last.theta, keep, folds)
     slow = slow_noise_variables(OwnNoise(found.told.residual, None).slow_std())
     found = inquiry.on_every_sample(found)
-    first, last, record = found.first, with_colour(found.record, found.last, how), found.record
+    first, last, record = found.first, refit.with_colour(found.record, found.last, how), found.record
     calibration, errors = calibrated(last.fit), {}
     if last.adopted and last.fit.posterior is None:
         together = with_coefficients(last)
@@ -139,13 +139,14 @@ def close_loop(
     given |= errors | slow
     before_fit = np.linalg.norm(survey.values("b_raw"), axis=2) - survey.values("total_field")[:, None]
     given["residual/total_field_before"] = (("time", "sensor"), before_fit, {"units": "nT", "long_name": "|b_raw| - F"})
-    alone = calibrated(first.fit)
+    # as a user has it who looks for no effect: without what nothing that was declared explains
+    alone = calibrated((last if same else refit.settled(record, first, inquiry.how)).fit)
     given["declared/matrix"] = (("sensor", "axis", "raw_axis"), alone.matrix, {})
     given["declared/offset"] = (("sensor", "raw_axis"), alone.offset, {"units": "nT"})
     given["loop/verdict"] = ((), json.dumps(outcome, default=float), {})
     if not last.fit.keep.all():
         doubted = np.zeros(len(survey.time), dtype=bool)
-        doubted[record.samples[disturbed(record, last, how)]] = True
+        doubted[record.samples[refit.disturbed(record, last, how)]] = True
         doubted = survey.made_from(doubted)
         late = unread(last.adopted, survey.time)
         bad = (doubted | late)[:, None]

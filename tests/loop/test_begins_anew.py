@@ -23,6 +23,7 @@ WARMING = {"type": "warm_up", "tau_s": 120.0, "nT": [[0.0] * 3, [2.0, -1.5, 1.0]
 RETUNED = {"type": "scale_step", "time_s": [250.0], "ppm": [[0.0] * 3, [20.0, -15.0, 25.0], [0.0] * 3, [0.0] * 3]}
 MOVED = {"type": "reference_step", "time_s": [250.0], "steps_nT": [1.5]}
 Found = Callable[[dict[str, Any]], tuple[ClosedLoop, Path]]
+STEPS = ["offset_step", "scale_step", "turn_step"]
 LATER = "2026-06-12T09:00:00Z"
 
 
@@ -201,3 +202,23 @@ def test_lengths_tell_what_sensors_do_not(tmp_path: Path, effect: dict[str, Any]
         with h5py.File(later) as file:
             error = np.linalg.norm(b, axis=2) - file["truth/total_field_true"][()][:, None]
         assert np.sqrt(np.mean(error**2)) < 0.17  # of noise 0.15 nT; the drift makes 0.6 nT
+
+
+@pytest.mark.long
+def test_what_happened_at_one_moment_is_dated_together(tmp_path: Path) -> None:
+    """A tool, taken away after a third of the survey, that the second one has never seen, whatever the dates say; and
+    the error before is that of who looks for no effect, and so has flagged that third."""
+    first, second = (survey_file(tmp_path, scenario(seed, rate_Hz=1.0), f"{seed}.h5") for seed in (31, 32))
+    tool = 1e-4 * np.array([[3.0, 1.0, -2.0], [1.0, -2.0, 1.0], [-2.0, 1.0, -1.0]])
+    with h5py.File(first, "a") as file:
+        raw = file["b_raw"][:]
+        third = raw[: len(raw) // 3]
+        share = np.array([1.0, 0.5, 0.3, 0.4])[:, None]
+        third += share * (np.array([30.0, -50.0, 20.0]) + third @ tool)
+        file["b_raw"][:] = raw
+    told, alone = (
+        magtensor.close_loop(first, search=names, verify=second).verdict["error"]["verify"] for names in (STEPS, [])
+    )
+    before, after, linear = (v["total_field_rms_nT"]["all"] for v in (told["before"], told["after"], alone["after"]))
+    assert before == pytest.approx(linear, rel=0.02)
+    assert after == pytest.approx(linear, rel=0.02)

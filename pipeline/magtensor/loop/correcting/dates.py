@@ -28,27 +28,43 @@ def as_dated_here(
     record: Record,
     calibration: ArrayCalibration,
     own: Sequence[tuple[Adopted, Array]],
-    number: int,
+    dated: Sequence[int],
     good: NDArray[np.bool_],
-) -> Adopted:
-    """An effect that is known to go with the time since the survey of the calibration began, as this survey shows it.
+) -> dict[int, Adopted]:
+    """Effects that are known to go with the time since the survey of the calibration began, as this survey shows them:
+    those of which it says something else.
 
     What the survey says comes before the dates: a drift of what is switched on with the survey and a jump at the same
     time of each begin anew, a jump was mended or has not happened yet, or the clock was never set. That has to be
     nearer to what is measured, and its course to be seen there whatever the offsets are, which differ from survey to
-    survey. A steady drift that goes on has the course of one that begins anew too, and is elsewhere.
+    survey. A steady drift that goes on has the course of one that begins anew too, and is elsewhere. What is clearest
+    comes first: beside it the others may be seen that happened at one moment with it.
 
     Parameters
     ----------
-    own: the effects of instrument and reference with their coefficients, `number` being the one that is asked about.
+    own: the effects of instrument and reference with their coefficients, `dated` those that are asked about.
     good: (N,) the samples whose lengths count.
     """
+    own, found = list(own), dict[int, Adopted]()
+    shown = {i: _shown(record, calibration, own[i][0], good) for i in dated if own[i][0].start is not None}
+    places = {i: here for i, here in shown.items() if here is not None}
+    while places:
+        each = {i: _nearest(record, own, i, here) for i, here in places.items()}
+        clearest = max(each, key=lambda i: each[i][1])
+        if each[clearest][1] <= 0.0:
+            break
+        found[clearest] = each[clearest][0]
+        own[clearest] = found[clearest], own[clearest][1]
+        del places[clearest]
+    return found
+
+
+def _nearest(
+    record: Record, own: Sequence[tuple[Adopted, Array]], number: int, here: Here | _Lengths
+) -> tuple[Adopted, float]:
+    """An effect with the start that is nearest to what is measured, and by how much of the sum of squares, nT^2, it is
+    nearer than the known one: 0 where that stays."""
     model, theta = own[number]
-    if model.start is None:
-        return model
-    here = _shown(record, calibration, model, good)
-    if here is None:
-        return model
     dated, left = here.added(model, theta), here.left(own)
     nearest, most = model, 0.0
     for other in _otherwise(model, record):
@@ -57,7 +73,7 @@ def as_dated_here(
         part, known = seen_in(left, course)
         if nearer > most and part > ANEW and known:
             nearest, most = other, nearer
-    return nearest
+    return nearest, most
 
 
 def _shown(

@@ -119,7 +119,8 @@ def on_its_clock(
     own = [i for i in moved if not _lacking(known[i], record)]
     own = [i for i in own if known[i].name != NAME]  # its waveform here is found when the others are taken off
     effects = [(known[i], theta[i]) for i in own]
-    here = {i: as_dated_here(record, fitted, effects, own.index(i), survey.good) for i in dated if i in own}
+    asked = [own.index(i) for i in dated if i in own]
+    here = {own[i]: a for i, a in as_dated_here(record, fitted, effects, asked, survey.good).items()}
     return [here.get(i, a) for i, a in enumerate(known)]
 
 
