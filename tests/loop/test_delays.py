@@ -17,6 +17,7 @@ from magtensor.simulate import simulate, write
 
 NOISE_NT = 0.15
 HAND = {"type": "tumbling", "duration_s": 400.0, "rate_rms_deg_s": 40.0, "rate_time_s": 2.0}  # 350 nT for 10 ms
+TILTED = {"type": "limited_tilt", "duration_s": 1800.0, "tilt_deg": 40.0}
 TURNING = [
     "sampling_lag",
     "lag_step",
@@ -88,6 +89,19 @@ def test_of_two_sensors_one_that_is_late_is_told_from_one_that_is_filtered(tmp_p
     pair["instrument"] = pair["instrument"] | {"array": {"positions_m": [[0.25, 0.0, 0.0], [-0.25, 0.0, 0.0]]}}
     told = verdict_of(tmp_path, pair, models=["sampling_lag", "bandwidth", "eddy_current"])
     assert adopted_names(told) == {"sampling_lag"}
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("seed", [6, 7])
+def test_of_three_sensors_filters_are_named_where_the_samples_are_too_far_apart_to_tell(
+    seed: int, tmp_path: Path
+) -> None:
+    """To first order a filter is a delay of each axis. The noise of each axis is thought larger before the fit."""
+    tilted = scenario(seed, {"type": "bandwidth", "rms_nT": 0.45}, motion=TILTED)
+    tilted["instrument"] = tilted["instrument"] | {"array": {"shape": "triangle", "baseline_m": 0.5}}
+    told = verdict_of(tmp_path, tilted, models=["sampling_lag", "bandwidth", "eddy_current"])
+    (one,) = told["adopted"]
+    assert {one["error_model"], *one["indistinguishable_from"]} >= {"bandwidth", "sampling_lag"}
 
 
 @pytest.mark.long

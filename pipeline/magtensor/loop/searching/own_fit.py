@@ -24,16 +24,21 @@ from magtensor.loop.searching.contribution import happens_once, put_back, slices
 from magtensor.loop.searching.gates import Candidate
 from magtensor.sharing import shared_out
 
+AS_MUCH = 0.5  # of what the best one explains
 SMALL = 0.1  # of the noise: what an effect across the field adds to its length, to second order
 
 
 def at_their_own_fit(candidates: Sequence[Candidate], record: Record, state: State, how: Fitting) -> list[Candidate]:
-    """The candidates, best first; those that are significant and not small judged anew.
+    """The candidates, best first; those that are significant and not small judged anew, and beside these what explains
+    as much: it is compared with them, and without it the outputs are thought to have more noise, each another.
 
     Each is fitted together with all that is adopted, on the samples that the fit without it believes. What it explains
     is put back into the residual of that fit, to first order, and assessed there; so are its plainer forms.
     """
     large = [c for c in candidates if c.significant and _large(c, state)]
+    if large:
+        least = AS_MUCH * max(c.assessment.gain.total for c in candidates)
+        large = [c for c in candidates if c in large or (c.significant and c.assessment.gain.total > least)]
     each_with = [[c, *_below(c, state)] for c in large]
     tried = [c for several in each_with for c in several]
     judged = iter(shared_out(lambda c: _judged(c, record, state, how), tried))
