@@ -295,6 +295,16 @@ def _told(attributes: Mapping[str, Any]) -> str:
     return (f" Calibration: {dated}." if dated else "") + (f" Offsets: {offsets}." if offsets else "")
 
 
+def verified(calibrated: Survey, path: Path | Held, planned: Plan) -> dict[str, Any]:
+    """As `verification`; where the other survey cannot be used, blocks that are None, and why: the fit is none the worse
+    for it."""
+    try:
+        return verification(calibrated, path, planned)
+    except DataError as error:
+        why = "; ".join(part for part in (error.what, error.hint) if part)
+        return {"before": None, "after": None, "not_possible": why}
+
+
 def verification(calibrated: Survey, path: Path | Held, planned: Plan) -> dict[str, Any]:
     """The error blocks of another survey: with the declared model alone, and with all that was adopted.
 

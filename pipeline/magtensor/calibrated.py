@@ -130,7 +130,7 @@ def require_sensors(survey: Survey, wanted: list[str], where: str) -> None:
         raise DataError(
             f"the calibration is for the sensors {', '.join(wanted)}, the survey has {', '.join(survey.sensors)}",
             where=where,
-            hint="name the calibration that was made with these sensors, or rename them in the recipe's mapping",
+            hint="name the calibration that was made with these sensors, or give the survey's sensors these names",
         )
 
 

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtensor import provenance, result
-from magtensor.applying import Applied, apply_to, fit_in_words, verification
+from magtensor.applying import Applied, apply_to, fit_in_words, verified
 from magtensor.atomic import atomic_path, atomic_set
 from magtensor.calibrated import contrasts, left_open
 from magtensor.calibration.recording import even_blocks
@@ -157,7 +157,7 @@ def run_long(
             whole = result.only(result.result_tree(survey), "calibration", "qc")
             made_by = _appended(folder / result.RESULT, whole, parts(), made_by)
             result.save(result.only(whole, "calibration"), made_by, folder / result.CALIBRATION)
-            checked = None if planned.verify is None else verification(survey, planned.verify, planned)
+            checked = None if planned.verify is None else verified(survey, planned.verify, planned)
             outcome = verdict(survey, verify=checked)
             outcome["error"]["fit"] = combined(blocks)
             result.write_verdict(folder, outcome)

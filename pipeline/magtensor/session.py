@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from magtensor import provenance, result
-from magtensor.applying import verification
+from magtensor.applying import verified
 from magtensor.atomic import refuse_overwriting, require_writable
 from magtensor.calibrated import left_open, told_of_fit
 from magtensor.dated import told_of_change
@@ -187,7 +187,7 @@ def compute(
 
 def judged(planned: Plan, done: RunResult, verify: Path | Held | None) -> Computed:
     """What a plan's stages made, with its verdict."""
-    checked = None if verify is None else verification(done.survey, verify, planned)
+    checked = None if verify is None else verified(done.survey, verify, planned)
     return Computed(planned, done.survey, done.records, verdict(done.survey, verify=checked), verify)
 
 

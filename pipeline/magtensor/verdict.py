@@ -116,8 +116,9 @@ def _named(adopted: Sequence[Mapping[str, Any]]) -> list[str]:
 
 def _with_its_channel(a: Mapping[str, Any]) -> str:
     name, settings = str(a["error_model"]), a.get("settings", {})
-    if name == "channel_response" and (channel := settings.get("channel")):
-        name = f"{name} of {channel}"
+    channel, others = settings.get("channel"), a.get("channels_as_good", [])
+    if channel and (name == "channel_response" or others):
+        name = f"{name} of {channel}" + (f" (or of {' or '.join(others)})" if others else "")
     if like := a.get("most_like_channel"):
         name = f"{name} (most like channel {like})"
     return f"{name} by a curve" if settings.get("bends") else name
@@ -126,6 +127,8 @@ def _with_its_channel(a: Mapping[str, Any]) -> str:
 def _disagreement(outcome: dict[str, Any]) -> str:
     """Words where the verification survey contradicts the calibration."""
     verify, held_out = outcome["error"].get("verify"), outcome["error"].get("held_out")
+    if why := (verify or {}).get("not_possible"):
+        return f"; NOT verified: {why}"
     if not verify or not held_out:
         return ""
     if as_read := verify.get("total_field_as_read"):

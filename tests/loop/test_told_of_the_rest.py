@@ -189,3 +189,5 @@ def test_what_was_adopted_more_than_once_is_counted_and_a_channel_named() -> Non
         "error": {"fit": blocks, "held_out": {"before": blocks, "after": blocks}},
     }
     assert "traced to 2 x offset_step, channel_response of throttle:" in sentence(outcome)
+    adopted[2] |= {"error_model": "temperature_offset", "channels_as_good": ["intake", "room"]}
+    assert "2 x offset_step, temperature_offset of throttle (or of intake or room):" in sentence(outcome)

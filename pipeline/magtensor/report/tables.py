@@ -122,6 +122,8 @@ def _verdict_columns(blocks: Mapping[str, Any]) -> list[tuple[str, Mapping[str, 
             columns.append((heading, block))
             continue
         before, after = block.get("before") or {}, block.get("after") or {}
+        if not (before or after):  # the survey could not be used
+            continue
         if before == after:  # nothing was adopted: one figure, not two equal ones
             columns.append((heading, after))
         else:

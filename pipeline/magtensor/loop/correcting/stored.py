@@ -22,7 +22,7 @@ from magtensor.loop.correcting.correction import corrected_raw, corrected_refere
 from magtensor.loop.correcting.dates import LONG, as_dated_here
 from magtensor.loop.correcting.lengths import AVERAGING, averaged_otherwise, contradicted
 from magtensor.loop.fitting.model import Adopted, Record, unread
-from magtensor.loop.fitting.record import record_of
+from magtensor.loop.fitting.record import channels_of, record_of
 from magtensor.registry import Registry
 from magtensor.survey.flags import flag_ranges
 from magtensor.survey.model import Survey, Variable
@@ -280,7 +280,7 @@ def cleaned(
             raise DataError(
                 f"the effect {effect.name} of the calibration cannot be taken off: this survey has no {lacking}",
                 where=where,
-                hint=f"it logs {', '.join(sorted(record.logged)) or 'no channel'}; "
+                hint=f"it logs {', '.join(sorted(channels_of(survey)[0])) or 'no channel'}; "
                 "apply a calibration without this effect, or log what it follows",
             )
     try:
