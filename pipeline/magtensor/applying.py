@@ -296,8 +296,7 @@ def _told(attributes: Mapping[str, Any]) -> str:
 
 
 def verified(calibrated: Survey, path: Path | Held, planned: Plan) -> dict[str, Any]:
-    """As `verification`; where the other survey cannot be used, blocks that are None, and why: the fit is none the worse
-    for it."""
+    """As `verification`; where the other survey cannot be used, blocks that are None, and why: the fit is as good."""
     try:
         return verification(calibrated, path, planned)
     except DataError as error:
