@@ -57,6 +57,7 @@ SETTLED = 0.1  # of the noise of a sample, along the vectors of a source
 LEAST_NOISE = 0.1  # of what the fit believes
 IMPROPER = 1 / 3  # of the noise of a sensor's usual axis
 SINGLE_STRETCH = "it acts in a single short stretch, which no other can confirm"
+FEW = 8.0  # independent values: any course with fewer is like some channel, through some power and lag
 ONCE = 0.9  # of a waveform's power in a stretch as long as one that is held out
 OF_A_CHANNEL = "its waveform follows channel"
 SECOND = 0.1  # a second factor this strong beside the first: not one waveform
@@ -356,6 +357,14 @@ def _turning(record: Record, state: State) -> bool:
     )
 
 
+def independent(waveform: Array) -> float:
+    """How many independent values a waveform (N,) amounts to: of sines and cosines with as much power each, so many."""
+    from scipy.fft import rfft
+
+    power = np.abs(rfft(waveform - waveform.mean())) ** 2
+    return float(2.0 * power.sum() ** 2 / max(np.sum(power**2), 1e-300))
+
+
 def shared_words(found: Sought, sensors: Sequence[str]) -> str:
     """A waveform that the sensors share, in words."""
     strength = np.sqrt(np.sum(found.direction**2, axis=1))
@@ -369,6 +378,8 @@ def shared_words(found: Sought, sensors: Sequence[str]) -> str:
         name, lag, power, correlation = found.like
         to_the = "" if power == 1 else f" to the power {power}"
         words += f" and is most like channel {name}{to_the} with a lag of {lag:.3g} s (correlation {correlation:+.2f})"
+        if independent(found.values) < FEW:
+            words += ", as one of several channels, powers and lags is of anything that swings so seldom"
     else:
         words += " and follows no logged channel"
     said = found.like is not None and found.objection.startswith(OF_A_CHANNEL)
