@@ -90,6 +90,7 @@ def test_a_drift_that_lies_in_a_few_folds_passes_by_the_spectra_of_the_sensors(
 
     assessed = replace(
         one.assessment, p=1e-4, own_p=own_p, gain=gain(80.0, -1.0), null_gain=gain(-80.0, 0.0),
+        estimate=replace(one.assessment.estimate, theta=np.zeros_like(one.assessment.estimate.theta)),
         focused=gain(5.0, 6.0), null_focused=gain(null_focused, null_focused),
     )  # fmt: skip
     registry = Registry.load()
@@ -100,6 +101,19 @@ def test_a_drift_that_lies_in_a_few_folds_passes_by_the_spectra_of_the_sensors(
     )  # fmt: skip
     assert not changed.assessment.gain.consistent and drift.adds_to_axes
     assert changed.passes is passes
+
+
+@pytest.mark.parametrize(("times", "believed"), [(1.0, True), (4.0, True), (6.0, False)])
+def test_what_predicts_far_more_than_it_explains_is_not_believed(one: Candidate, times: float, believed: bool) -> None:
+    """What is adopted already errs by that much on blocks that it was not fitted to."""
+    each = np.ones(10)
+    estimate = one.assessment.estimate
+    explained = estimate.explained_beside(len(estimate.theta) - one.terms.count)
+    gain = Gain(10.0 * times * explained * each, 9.9 * times * explained * each, each)
+    changed = replace(one, adjusted_p=0.0, assessment=replace(one.assessment, gain=gain))
+    assert gain.total == pytest.approx(times * explained) and gain.consistent
+    assert bool(changed.predicts) is believed
+    assert ("far more than it explains" in why(changed, None)) is not believed
 
 
 def test_a_weak_turn_that_twelve_blocks_cannot_prove_among_the_whole_catalogue() -> None:

@@ -238,7 +238,9 @@ def test_what_gives_way_is_told_whether_it_explained_less(
     def candidate(name: str, gain: float) -> Any:
         figures = SimpleNamespace(gain=SimpleNamespace(total=gain, t=5.0))
         passing = {"significant": True, "beyond_slow_noise": True, "passes": True, "alpha": 0.005}
-        refused = dict.fromkeys(("of_the_log", "of_second_order", "of_the_law", "of_no_shape", "log_noise"), False)
+        refused = dict.fromkeys(
+            ("of_the_log", "of_second_order", "of_the_law", "of_no_shape", "of_no_blocks", "log_noise"), False
+        )
         p = {"adjusted_p": 1e-9, "adjusted_own_p": 1e-9}
         return SimpleNamespace(model=SimpleNamespace(name=name), assessment=figures, **passing, **refused, **p)
 

@@ -35,6 +35,16 @@ class Estimate:
         out: Array = self.covariance @ (self.normal @ theta)
         return out
 
+    def beside(self, first: int) -> Array:
+        """The information on the coefficients from a number on, those before it free."""
+        n, mixed = self.normal, self.normal[first:, :first]
+        return np.asarray(n[first:, first:] - mixed @ np.linalg.pinv(n[:first, :first], hermitian=True) @ mixed.T)
+
+    def explained_beside(self, first: int) -> float:
+        """Sum of squares that these explain beside those before, on all blocks."""
+        own = self.theta[first:]
+        return float(own @ self.beside(first) @ own)
+
 
 def symmetric_eigen(m: Array) -> tuple[Array, Array]:
     """Eigenvalues and vectors of symmetric matrices (..., P, P).

@@ -20,6 +20,7 @@ ALPHA = 0.005  # family-wise probability that a clean survey gets an adoption, b
 SECOND_ORDER = 1e-5  # of the sum of squares that is explained: 0.3 % of an effect's size
 OF_THE_LAW = 0.0025  # the same, that the law of an effect may miss: 5 % of its size
 LEAST_REDUCTION = 1e-4  # of the held-out sum of squares: smaller is significant only in very long surveys
+FAR_MORE = 5.0  # times what is explained: two effects of one trend, which help each other, come to twice it
 UNEVENLY = 1.0  # paired t: one standard deviation; what predicts nothing has as much one time in six
 MUCH = 0.1  # of the held-out sum of squares: no noise of a clean survey is predicted so well
 LOG_MARGIN = 1.5  # the noise of a log is known to some per cent
@@ -92,6 +93,14 @@ class Candidate:
         return self.assessment.left_there > MOST_LEFT
 
     @property
+    def of_no_blocks(self) -> bool:
+        """Whether it predicts far more than it explains: what is adopted cannot be known from the other blocks, and
+        errs by so much without it on those that are held out."""
+        estimate = self.assessment.estimate
+        explained = estimate.explained_beside(len(estimate.theta) - self.terms.count)
+        return 0.0 < FAR_MORE * explained < self.assessment.gain.total
+
+    @property
     def significant(self) -> bool:
         """Whether noise does not explain it, all that was tried considered.
 
@@ -152,7 +161,7 @@ class Candidate:
     @property
     def _more_than_known(self) -> bool:
         """Whether neither what is adopted nor the log's noise explains it, and it is large enough to matter."""
-        if self.of_the_log or self.of_second_order or self.of_the_law or self.of_no_shape:
+        if self.of_the_log or self.of_second_order or self.of_the_law or self.of_no_shape or self.of_no_blocks:
             return False
         gain = self.assessment.gain
         return gain.total / max(float(gain.before.sum()), 1e-300) > LEAST_REDUCTION

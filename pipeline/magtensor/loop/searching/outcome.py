@@ -176,6 +176,8 @@ def why(candidate: Candidate, winner: Candidate | None) -> str:
         return f"less than 5 % of an adopted effect of the same driver and sensors, whose law may miss it: {figures}"
     if candidate.of_no_shape:
         return f"leaves {candidate.assessment.left_there:.0%} of what there was at its time: {figures}"
+    if candidate.of_no_blocks:
+        return f"predicts far more than it explains, for what is adopted is not known from the other blocks: {figures}"
     if not candidate.beyond_slow_noise:
         return f"slow noise as strong as the residual's own would explain as much: {figures}"
     if not candidate.passes:

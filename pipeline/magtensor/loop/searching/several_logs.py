@@ -43,7 +43,7 @@ def of_another_log(state: State, model: Adopted, terms: Terms, estimate: Estimat
     alike = [which for which, vector in vectors.items() if vector.any()]
     first = state.terms.count
     patterns = np.array([vectors[which] for which in alike]).T
-    if not alike or not _along(estimate.theta[first:], _information_beside(estimate, first), patterns):
+    if not alike or not _along(estimate.theta[first:], estimate.beside(first), patterns):
         return 0.0
     return brought_in(state, set().union(*(channels_of(state.adopted[which], x) for which in alike)))
 
@@ -61,16 +61,9 @@ def worse_log(best: Candidate, other: Candidate, behind: float, state: State) ->
     first = len(best.assessment.estimate.theta) - best.terms.count
     own, its = best.assessment.estimate.theta[first:], other.assessment.estimate.theta[first:]
     pattern = _vector(other.terms, its, best.terms)[:, None]
-    if not pattern.any() or not _along(own, _information_beside(best.assessment.estimate, first), pattern):
+    if not pattern.any() or not _along(own, best.assessment.estimate.beside(first), pattern):
         return False
     return behind <= gained_of_a_log(would_bring_in(state, other.model, its), other.assessment.estimate.rank)
-
-
-def _information_beside(estimate: Estimate, first: int) -> Array:
-    """The information on the coefficients from a number on, those before it free."""
-    n = estimate.normal
-    mixed = n[first:, :first]
-    return np.asarray(n[first:, first:] - mixed @ np.linalg.pinv(n[:first, :first], hermitian=True) @ mixed.T)
 
 
 def _along(theta: Array, information: Array, patterns: Array) -> bool:
