@@ -3,18 +3,25 @@ far more may be one."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import h5py
 import numpy as np
 import pytest
-from loop_cases import BASE, adopted_names, scenario, survey_file, suspects, verdict_of
+from loop_cases import BASE, adopted_names, loaded, scenario, survey_file, suspects, verdict_of
 from scipy.stats import ncx2
 
 from magtensor import close_loop
+from magtensor.error_models.terms import joined
+from magtensor.loop.evidence.assessment import estimated
 from magtensor.loop.fitting.log_noise import white_noise
+from magtensor.loop.fitting.model import Adopted, Fitting
+from magtensor.loop.fitting.refit import joint_state
 from magtensor.loop.searching.gates import gained_of_a_log
+from magtensor.loop.searching.several_logs import of_another_log
+from magtensor.registry import Registry
 
 
 @pytest.mark.parametrize("log_noise", [1.0, 30.0, 300.0])
@@ -51,6 +58,35 @@ def test_a_range_that_is_logged_changes_offset_and_scale_of_a_sensor(tmp_path: P
     assert {a["settings"]["times_field"] for a in told["adopted"]} == {True, False}
     assert [(a["sensors"], a["settings"]["channel"]) for a in told["adopted"]] == 2 * [(["S2"], "range_2")]
     assert not told["unexplained"]["present"], told["unexplained"]["description"]
+
+
+def test_what_any_function_of_another_log_knows_of_that_noise_lies_along_the_vectors_of_the_first(
+    tmp_path: Path,
+) -> None:
+    """A thermometer whose noise is half of its signal, and a square of another one that goes partly as it does."""
+    record = loaded(tmp_path, scenario(83, {"type": "temperature_offset", "rms_nT": 1.0}))
+    true, rng = record.logged["temperature"], np.random.default_rng(2)
+    noise = 0.5 * true.std() * rng.standard_normal(len(true))
+    other = np.sqrt(np.abs(noise)) * np.sign(rng.standard_normal(len(true)))  # whose square knows the size of the noise
+    channels = {"temperature": true + noise, "temperature_air": other}
+    record = replace(
+        record, logged=channels, origins={name: np.asarray(0.0) for name in channels},
+        units=dict.fromkeys(channels, "degC"),
+    )  # fmt: skip
+    model = Registry.load().find("error_model", "temperature_offset")
+    settings = {"order": 1, "lag_s": 0.0, "delayed": False, "at_start": 0.0, "bends": ()}
+    state = joint_state(record, [Adopted(model, settings | {"channel": "temperature"})], Fitting())
+    for along in (True, False):
+        second = Adopted(model, settings | {"channel": "temperature_air", "order": 2})
+        terms = second.terms(state.excitation).at(state.residual.samples)
+        both = estimated(state.residual, joined([state.terms, terms]), state.colours)
+        theta = both.theta.copy()
+        squares = np.array([name not in "xyz" for name in terms.names])
+        assert squares.sum() == len(state.theta[0])
+        theta[-terms.count :] = 0.0
+        theta[-terms.count :][squares] = 1e3 * (state.theta[0] if along else rng.standard_normal(squares.sum()))
+        gained = of_another_log(state, second, terms, replace(both, theta=theta))
+        assert (gained > 0.0) is along
 
 
 def on_a_bus(*effects: dict[str, Any], current_noise_A: float) -> dict[str, Any]:

@@ -7,6 +7,8 @@ same cause has those of the first, and a further effect has vectors of its own.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from magtensor.calibration.types import Array
@@ -26,7 +28,7 @@ def of_another_log(state: State, model: Adopted, terms: Terms, estimate: Estimat
     same causes; 0 for one that does not.
 
     Where effects of two currents are corrected with their noisy logs, the voltage that sags under both knows something
-    of that noise. All that it explains of it lies along the currents' own vectors.
+    of that noise. All that it explains of it, by whatever function of itself, lies along the currents' own vectors.
 
     Parameters
     ----------
@@ -36,13 +38,13 @@ def of_another_log(state: State, model: Adopted, terms: Terms, estimate: Estimat
     if state.terms is None or not channels_of(model, x):
         return 0.0
     vectors = {
-        which: _vector(state.terms.only(range(part.start, part.stop)), state.theta[which], terms)
+        which: _vectors(state.terms.only(range(part.start, part.stop)), state.theta[which], terms)
         for which, part in enumerate(slices(state))
         if channels_of(state.adopted[which], x)
     }
-    alike = [which for which, vector in vectors.items() if vector.any()]
+    alike = [which for which, several in vectors.items() if several]
     first = state.terms.count
-    patterns = np.array([vectors[which] for which in alike]).T
+    patterns = np.array([vector for which in alike for vector in vectors[which]]).T
     if not alike or not _along(estimate.theta[first:], estimate.beside(first), patterns):
         return 0.0
     return brought_in(state, set().union(*(channels_of(state.adopted[which], x) for which in alike)))
@@ -82,6 +84,20 @@ def _vector(own: Terms, theta: Array, like: Terms) -> Array:
     """The coefficients of a model in the places of another's that act on the same axes in the same way, 0 elsewhere."""
     place = {label: float(value) for label, value in zip(_labels(own), theta, strict=True)}
     return np.array([place.get(label, 0.0) for label in _labels(like)])
+
+
+def _vectors(own: Terms, theta: Array, like: Terms) -> list[Array]:
+    """The same, of each function of its channel that another model has: the model's own first function in the places of
+    that, where it acts there at all."""
+    functions = [name.rpartition(" ")[0] for name in like.names]
+    axes = [name.rpartition(" ")[2] for name in like.names]
+    found = []
+    for each in dict.fromkeys(functions):
+        names = tuple(axis if f == each else "" for axis, f in zip(axes, functions, strict=True))
+        vector = _vector(own, theta, replace(like, names=names))
+        if vector.any():
+            found.append(vector)
+    return found
 
 
 def _labels(terms: Terms) -> list[tuple[str, str, str]]:
