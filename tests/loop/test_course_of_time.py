@@ -42,6 +42,7 @@ LAWS: dict[str, Callable[[Array], Array]] = {
     "second order": lambda u: 8.0 * u / (1.0 + 7.0 * u),
     "two exponentials": lambda u: 0.5 * np.exp(-u / 0.05) + 0.5 * np.exp(-u / 0.5),
     "there and on": lambda u: 1.0 / (1.0 + np.exp(-8.0 * (u - 0.4))),
+    "there and flat": lambda u: np.minimum(u / 0.15, 1.0),
     "there and back": lambda u: (2.0 * u - 1.0) ** 4,
 }
 

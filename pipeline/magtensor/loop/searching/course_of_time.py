@@ -3,7 +3,8 @@
 A thermometer that settles is a smooth course of time, and so is a drift. Seen through a lag, from a beginning that is
 fitted, such a channel comes near to many drifts and follows none of them quite. Two questions tell: does the channel
 explain anything beside smooth courses of time in its place, and do these explain anything beside the channel. Where it
-does not and they do, the data know a course of time that is not the channel's. And where a far larger one is adopted
+does not and they do, the data know a course of time that is not the channel's; nor is it where both do, and the channel
+by no more: what begins with the survey and goes up once resembles whatever warms up, but for a corner that neither has. And where a far larger one is adopted
 already, whose law nobody knows, what the channel would explain beside it may as well be that law's. What lags the
 field by as much as the survey is long is asked the same.
 """
@@ -34,6 +35,7 @@ COURSES = 8  # polynomials of the root of time, which is steep at the start: a t
 FIRST_LEFT = 2 * COURSES  # the lowest cosine frequency at which they leave the slow noise that there is
 SEEN = 1e-3  # probability that noise makes a channel explain as much beside them
 MORE = 1e-5  # the same of them beside a channel: slow noise is not known to better than that
+MORE_OF_ITS_OWN = 2.0  # times what they explain beside a channel that it explains beside them, if both do
 MISSED = 0.1  # of the sum of squares, by the law of a drift: a third of its size, as a line misses of what slows down
 THE_FIELD = "the field"  # no channel has that name
 STEP = 0.01  # of a setting, over which the change of what it explains is taken
@@ -73,12 +75,16 @@ def beside_time(candidate: Candidate, state: State) -> BesideTime:
     def explains(seen: Residual, *terms: Terms) -> float:
         return explained(estimated(seen, joined([*held, *terms]), colours))
 
-    if _chance(explains(residual, own, courses) - explains(residual, courses), own.count) < SEEN:
+    channel_beside = explains(residual, own, courses) - explains(residual, courses)
+    time_beside = explains(between, own, courses) - explains(between, own)
+    of_time = _chance(time_beside, courses.count) < MORE
+    told = channel_beside - own.count > MORE_OF_ITS_OWN * (time_beside - courses.count)
+    if _chance(channel_beside, own.count) < SEEN and (told or not of_time):
         return BesideTime(True)
     if candidate.assessment.gain.total <= MISSED * explained_by_courses(state, candidate):
         return BesideTime(False, f"{name} explains nothing beside smooth courses of time, and a drift is adopted")
-    if _chance(explains(between, own, courses) - explains(between, own), courses.count) < MORE:
-        return BesideTime(False, f"smooth courses of time explain more than {name}, and leave it nothing")
+    if of_time:
+        return BesideTime(False, f"smooth courses of time explain more than {name}, and leave it little")
     if name != THE_FIELD and hardly_begun(model, x):
         return BesideTime(
             False, f"{name}, seen through a lag of more than half of the survey, is a drift like any other"
