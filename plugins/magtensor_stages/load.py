@@ -13,7 +13,9 @@ from magtensor.components import stage
 from magtensor.errors import DataError, NotEnoughData, UsageError, did_you_mean
 from magtensor.survey import checks, recorded_numbers, repeated, time_base
 from magtensor.survey.flags import Flag, flag_ranges
+from magtensor.survey.misread import misread
 from magtensor.survey.model import AXES, Survey
+from magtensor.units import TEMPERATURE, UNITS
 
 BY = "load"
 _READ_TOGETHER = 0.5  # of the readings of the sensor that has the fewest
@@ -75,6 +77,7 @@ def load(
     if len(found.time) < 2:
         raise NotEnoughData("a single sample is no survey", where=where)
     found = _without_fill_values(found, notes)
+    found = _without_misreadings(found, notes)
     found, impossible = _without_impossible(found)
     _refuse_faults(found, magnitude, copied_axes, where)
     _judge_position(found, magnitude, where, notes)
@@ -277,6 +280,28 @@ def _without_fill_values(survey: Survey, notes: list[str]) -> Survey:
             variable = survey[name]
             filled[name] = (tuple(variable.dims), np.where(values == found, np.nan, values), variable.attrs)
     return survey.merged(filled) if filled else survey
+
+
+def _without_misreadings(survey: Survey, notes: list[str]) -> Survey:
+    """The survey with readings of logged channels that cannot be made missing; vectors, which feel a shock, as read."""
+    from magtensor.loop.fitting.record import channels_of
+
+    kept: dict[str, Any] = {}
+    logged, units = channels_of(survey)
+    for name, values in logged.items():
+        if "axis" in survey[name].dims:
+            continue
+        known = UNITS.get(units[name])
+        found = misread(values, slow=known is not None and known.dimension == TEMPERATURE)
+        if found.any():
+            seen = np.unique(values[found])
+            which = f"{seen[0]:.6g}" if len(seen) == 1 else f"{seen[0]:.6g} to {seen[-1]:.6g}"
+            notes.append(
+                f"{name}: {found.sum()} values ({which}), alone and far from all others, are taken for missing"
+            )
+            variable = survey[name]
+            kept[name] = (tuple(variable.dims), np.where(found, np.nan, values), variable.attrs)
+    return survey.merged(kept) if kept else survey
 
 
 def _without_impossible(survey: Survey) -> tuple[Survey, dict[str, NDArray[np.bool_]]]:

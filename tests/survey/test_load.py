@@ -102,7 +102,6 @@ WARM = 18.0 + 4.0 * np.sin(np.arange(400) / 60.0)
         (np.where(np.arange(400) > 300, 9999.9, WARM).astype(np.float32), 9999.9),
         (np.where(np.arange(400) == 3, -9999.0, np.where(np.arange(400) % 3, np.nan, WARM)), -9999.0),
         (WARM, None),
-        (np.where(np.arange(400) % 90 == 7, -321.0, WARM), None),  # a spike, whatever it is
         (np.arange(600.0, 1000.0), None),  # a counter gets there
         (np.where(np.arange(400) % 2, 999.0, WARM), None),  # as often as not: a switch
         (np.where(np.arange(400) % 5, 0.0, 999.0), None),  # two levels
@@ -309,3 +308,11 @@ def test_readers_and_options_are_checked_before_any_file_is_opened(tmp_path: Any
     assert "has no option delimeter (did you mean delimiter?)" in problems["sensors.A.options.delimeter"]
     with pytest.raises(UsageError, match="txet"):
         Source(section, tmp_path, registered).read()
+
+
+def test_readings_of_a_channel_that_cannot_be(load_variables: Load, variables: Variables) -> None:
+    values = np.where(np.arange(400) % 90 == 7, 85.0, WARM)
+    survey = load_variables({**variables, "temperature": (["time"], values, {"units": "degC"})})
+    np.testing.assert_array_equal(survey.values("temperature"), np.where(values == 85.0, np.nan, WARM))
+    said = "temperature: 5 values (85), alone and far from all others, are taken for missing"
+    assert survey.attributes["notes"] == [said]

@@ -4,9 +4,9 @@ A thermometer that settles is a smooth course of time, and so is a drift. Seen t
 fitted, such a channel comes near to many drifts and follows none of them quite. Two questions tell: does the channel
 explain anything beside smooth courses of time in its place, and do these explain anything beside the channel. Where it
 does not and they do, the data know a course of time that is not the channel's; nor is it where both do, and the channel
-by no more: what begins with the survey and goes up once resembles whatever warms up, but for a corner that neither has. And where a far larger one is adopted
-already, whose law nobody knows, what the channel would explain beside it may as well be that law's. What lags the
-field by as much as the survey is long is asked the same.
+by no more: what goes up once resembles whatever warms up meanwhile, but for a corner that neither has. And where a far
+larger one is adopted already, whose law nobody knows, what the channel would explain beside it may as well be that
+law's. What lags the field by as much as the survey is long is asked the same.
 """
 
 from __future__ import annotations

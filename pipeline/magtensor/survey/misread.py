@@ -1,0 +1,69 @@
+"""Readings of a log that cannot be: alone, and far outside of all others that it holds.
+
+A thermometer on a bus answers 85.0 after a reset and -127 when it does not answer; a shunt's converter loses a bit. One
+such reading outweighs the course of a whole survey. What a log really does for a single reading moves a single sample,
+and little is lost if that is left to speak for itself.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from magtensor.survey.recorded_numbers import Bools, Floats, runs
+
+INNER = 0.02  # of the rows at either end of what a log holds, beyond the usual
+MOST = 0.02  # of the rows: what comes more often is no mistake of reading
+OUTSIDE = 1.0  # times the width of the inner readings, beyond these
+LONGEST = 2  # times as many rows as the others usually keep a value for: what lasts longer is no mistake of reading
+LEAST_ROWS = 50
+STEADY = 0.5  # mean square of the changes over that of white noise: a log has a course that a reading can depart from
+
+
+def misread(values: Floats, *, slow: bool = False) -> Bools:
+    """Where a log holds a reading that cannot be.
+
+    Never of a log that is mostly noise, or constant but for what stands out: nothing tells a mistake from a pulse there.
+
+    Args:
+        values: (N,) or (N, K), NaN where nothing was read.
+        slow: of a temperature, which neither jumps nor comes back at once: a mistake for as long as it lasts.
+
+    Returns:
+        of the same shape.
+    """
+    columns = values.reshape(len(values), -1)
+    found = np.column_stack([_of_one(column, slow) for column in columns.T])
+    return found.reshape(values.shape)
+
+
+def _of_one(values: Floats, slow: bool) -> Bools:
+    out = np.zeros(len(values), dtype=bool)
+    known = np.flatnonzero(np.isfinite(values))
+    if len(known) < LEAST_ROWS:
+        return out
+    read = values[known]
+    low, high = np.quantile(read, [INNER, 1.0 - INNER])
+    margin = OUTSIDE * (high - low)
+    far = (read < low - margin) | (read > high + margin)
+    if margin <= 0.0 or not far.any() or far.mean() > MOST:
+        return out
+    others = read[~far]
+    if np.mean(np.diff(others) ** 2) > STEADY * 2.0 * np.var(others):
+        return out
+    longest = len(read) if slow else LONGEST * _usual_run(others)
+    for a, b in _stretches(far):
+        if a > 0 and b < len(read) and b - a <= longest:
+            out[known[a:b]] = True
+    return out
+
+
+def _usual_run(values: Floats) -> float:
+    """Rows for which a log keeps a value, at half of its rows."""
+    _, lengths = runs(np.diff(values) == 0.0)
+    return float(np.median(np.repeat(lengths, lengths))) if 2 * lengths.sum() > len(values) else 1.0
+
+
+def _stretches(some: Bools) -> list[tuple[int, int]]:
+    """The first row of each stretch and the one after its last."""
+    edges = np.flatnonzero(np.diff(np.concatenate(([0], some.astype(int), [0]))))
+    return list(zip(edges[0::2].tolist(), edges[1::2].tolist(), strict=True))
