@@ -123,9 +123,14 @@ def regressors(component: Component, x: Excitation, settings: Mapping[str, Any])
         )
     if x.noisier is not None:
         terms = replace(terms, noise=_noise_in(terms, component, x.noisier, settings))
-    if "rotation" in component.declared({}).needs:
+    if turning(component):
         terms = replace(terms, noise=np.maximum(terms.noise, LAW_OF_TURNING))
     return terms
+
+
+def turning(component: Component) -> bool:
+    """Whether an effect follows the turning of the platform, by a law that is known to first order."""
+    return "rotation" in component.declared({}).needs
 
 
 def _noise_in(terms: Terms, component: Component, noisier: Excitation, settings: Mapping[str, Any]) -> Array:

@@ -14,7 +14,7 @@ from magtensor.error_models.waveform import NAME
 from magtensor.loop.evidence.assessment import estimated, explained
 from magtensor.loop.evidence.golden import golden
 from magtensor.loop.evidence.scoring import Scorer
-from magtensor.loop.fitting.model import Adopted, Fitting, Record, State
+from magtensor.loop.fitting.model import Adopted, Fitting, Record, State, turning
 from magtensor.loop.fitting.refit import joint_state
 from magtensor.loop.fitting.separation import SEPARATION
 from magtensor.loop.searching.beginnings import beginning, extent, least_gain, with_beginning
@@ -28,7 +28,7 @@ from magtensor.loop.searching.contribution import (
     significance_at_once,
     slices,
 )
-from magtensor.loop.searching.gates import Candidate
+from magtensor.loop.searching.gates import SECOND_ORDER, Candidate
 from magtensor.loop.searching.profiling import of_ratios
 from magtensor.loop.searching.split import coefficients
 
@@ -93,18 +93,18 @@ def _needed(state: State, which: int) -> tuple[str, ...] | None:
     return sensors if sensors is not None and _spare(state, which, sensors) else _sufficient(state, which)
 
 
-def _spare(state: State, which: int, sensors: tuple[str, ...]) -> bool:
+def _spare(state: State, which: int, sensors: tuple[str, ...], least: float = SEPARATION) -> bool:
     """Whether a model can do without its coefficients for all but some sensors.
 
     A coefficient may be insignificant because others can stand in for it, as where only differences between sensors
     are seen (a delay of all of them is a turn of the field): each could go, and not several of them. All that go have
-    to predict no more on held-out blocks than what tells two models apart.
+    to predict no more on held-out blocks than what tells two models apart, or the least that is asked for.
     """
     gone, seen, _ = _without_others(state, which, sensors)
     if seen < gone:
         return False
     gain = held_out(state, _kept(state, which, sensors))
-    return not (gain.total >= SEPARATION and gain.consistent)
+    return not (gain.total >= least and gain.consistent)
 
 
 def _sufficient(state: State, which: int) -> tuple[str, ...] | None:
@@ -113,21 +113,25 @@ def _sufficient(state: State, which: int) -> tuple[str, ...] | None:
     If only differences between sensors are seen, or little else, one that turned is like all others turned the other
     way: every coefficient is significant, or none is. None where no sensor suffices, or several do. What is not seen of
     several sensors is shared out among them, and wrong on each: where there is such a part, one alone may lose as much
-    as does not tell two models apart.
+    as does not tell two models apart. And what follows the turning may lose as much as its law may miss: by so much
+    all of them are moved together, which only the second order would tell.
     """
     from scipy.special import chdtri
 
     assert state.terms is not None
     owners = state.terms.sensors[slices(state)[which]]
+    missed = 0.0
+    if turning(state.adopted[which].component):
+        missed = SECOND_ORDER * _without_others(state, which, ())[2]
     found = []
     for sensor in sorted(set(owners) - {""}):
         gone, seen, lost = _without_others(state, which, (sensor,))
         if not seen:
             continue
-        least = float(chdtri(seen, KEEP_ALPHA))
+        least = max(float(chdtri(seen, KEEP_ALPHA)), missed)
         if lost >= (max(least, SEPARATION + seen) if seen < gone else least):
             continue
-        if seen < gone or _spare(state, which, (sensor,)):
+        if seen < gone or _spare(state, which, (sensor,), max(SEPARATION, missed)):
             found.append(sensor)
     return tuple(found) if len(found) == 1 else None
 
