@@ -79,19 +79,21 @@ def sentence(outcome: dict[str, Any]) -> str:
     if after is None:
         refined = "The tensor was refined; its error cannot be told without a tensor that is known."
         return refined if outcome["declared"] else "Nothing was calibrated."
-    figures = [
-        f"{name} {_change(before, after, key)} {unit} rms" for key, (name, unit) in ERRORS.items() if after.get(key)
-    ]
+    figures = _figures(before, after)
     floor = outcome["noise_floor_nT"]
     noise = f"; sensor noise {_figure(floor)} nT" if floor is not None else ""
-    told = f"{', '.join(figures)} {where}{noise}" if figures else f"no error figure can be given{noise}"
+    told = f"{figures} {where}{noise}" if figures else f"no error figure can be given{noise}"
     model = f"the {' and '.join(outcome['declared'])} model" if outcome["declared"] else "no model"
     adopted = _named([a for a in outcome["adopted"] if a.get("by") != "person"])
     by_hand = _named([a for a in outcome["adopted"] if a.get("by") == "person"])
     left = outcome["unexplained"]
     if adopted:
-        rises = [_of_all(after, key) > _of_all(before or {}, key) for key in ERRORS if _of_all(before or {}, key)]
-        head = "No error falls, but the residual looks like" if rises and all(rises) else "The residual was traced to"
+        falls, held_out = _falls(before, after), outcome["error"].get("held_out") or {}
+        if not falls and not _clearly_worse(before, after) and _falls(held_out.get("before"), held_out.get("after")):
+            falls = True
+            shown = _figures(held_out["before"], held_out["after"])
+            told = f"{shown} on held-out blocks{noise}; the errors {where} do not show it: {figures}"
+        head = "The residual was traced to" if falls else "No error falls, but the residual looks like"
         head += f" {', '.join(adopted)}"
         head += f"; adopted by hand: {', '.join(by_hand)}" if by_hand else ""
     elif by_hand:
@@ -106,6 +108,23 @@ def sentence(outcome: dict[str, Any]) -> str:
     tail = f"; unexplained: {left['description']}" if left["present"] else f"; of what is left {slow}" if slow else ""
     doubt = outcome.get("calibration", {}).get("description", "")
     return f"{head}: {told}{tail}{_disagreement(outcome)}{f'; {doubt}' if doubt else ''}."
+
+
+def _figures(before: dict[str, Any] | None, after: dict[str, Any]) -> str:
+    """The errors before and after, in words."""
+    return ", ".join(
+        f"{name} {_change(before, after, key)} {unit} rms" for key, (name, unit) in ERRORS.items() if after.get(key)
+    )
+
+
+def _falls(before: dict[str, Any] | None, after: dict[str, Any] | None) -> bool:
+    """Whether some error falls, or none is known that could."""
+    known = [key for key in ERRORS if _of_all(before or {}, key)]
+    return not known or any(_of_all(after or {}, key) <= _of_all(before or {}, key) for key in known)
+
+
+def _clearly_worse(before: dict[str, Any] | None, after: dict[str, Any]) -> bool:
+    return any(_of_all(after, key) > WORSE * _of_all(before or {}, key) > 0.0 for key in ERRORS)
 
 
 def _named(adopted: Sequence[Mapping[str, Any]]) -> list[str]:

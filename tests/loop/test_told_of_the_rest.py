@@ -175,6 +175,27 @@ def test_what_lowers_no_error_is_not_called_traced(total_field: float, tensor: f
     assert head in sentence(outcome)
 
 
+@pytest.mark.parametrize(
+    ("verified", "head"), [(0.161, "traced to lag_step: total field 0.9 -> 0.16 nT rms on held-out"), (0.3, "No error")]
+)
+def test_what_another_survey_does_not_show_is_told_by_held_out_blocks(verified: float, head: str) -> None:
+    def block(error: float) -> dict[str, Any]:
+        return {"total_field_rms_nT": {"all": error}, "tensor_rms_nT_per_m": None}
+
+    outcome = {
+        "declared": ["linear"],
+        "adopted": [{"error_model": "lag_step", "settings": {}, "kind": "instrument"}],
+        "noise_floor_nT": 0.15,
+        "unexplained": {"present": False, "description": "nothing", "excess_rms_nT": 0.0, "looks_like": []},
+        "error": {
+            "fit": block(0.16),
+            "held_out": {"before": block(0.9), "after": block(0.16)},
+            "verify": {"before": block(0.16), "after": block(verified)},
+        },
+    }
+    assert head in sentence(outcome)
+
+
 def test_what_was_adopted_more_than_once_is_counted_and_a_channel_named() -> None:
     blocks = {"total_field_rms_nT": {"all": 1.0}, "tensor_rms_nT_per_m": None}
     adopted = [

@@ -22,7 +22,7 @@ STEADY = 0.5  # mean square of the changes over that of white noise: a log has a
 def misread(values: Floats, *, slow: bool = False) -> Bools:
     """Where a log holds a reading that cannot be.
 
-    Never of a log that is mostly noise, or constant but for what stands out: nothing tells a mistake from a pulse there.
+    Never of a log that is mostly noise, or constant but for what stands out: nothing tells a mistake from a pulse.
 
     Args:
         values: (N,) or (N, K), NaN where nothing was read.
