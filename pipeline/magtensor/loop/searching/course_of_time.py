@@ -4,9 +4,9 @@ A thermometer that settles is a smooth course of time, and so is a drift. Seen t
 fitted, such a channel comes near to many drifts and follows none of them quite. Two questions tell: does the channel
 explain anything beside smooth courses of time in its place, and do these explain anything beside the channel. Where it
 does not and they do, the data know a course of time that is not the channel's; nor is it where both do, and the channel
-by no more: what goes up once resembles whatever warms up meanwhile, but for a corner that neither has. And where a far
-larger one is adopted already, whose law nobody knows, what the channel would explain beside it may as well be that
-law's. What lags the field by as much as the survey is long is asked the same.
+by no more, once it is fitted: what goes up once resembles whatever warms up meanwhile, but for a corner that neither
+has. And where a far larger one is adopted already, whose law nobody knows, what the channel would explain beside it may
+as well be that law's. What lags the field by as much as the survey is long is asked the same.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from magtensor.calibration.types import Array
 from magtensor.error_models.excitation import Excitation
 from magtensor.error_models.settings import Beginning, Choice, Orders, Range, profiled
 from magtensor.error_models.terms import Terms, joined
@@ -25,7 +26,7 @@ from magtensor.loop.evidence.residual import Residual, taken_off
 from magtensor.loop.fitting.log_noise import channels_of
 from magtensor.loop.fitting.model import Adopted, State
 from magtensor.loop.searching.beginnings import beginning, one_pattern
-from magtensor.loop.searching.contribution import happens_once
+from magtensor.loop.searching.contribution import happens_once, put_back_one
 from magtensor.loop.searching.gates import Candidate
 from magtensor.loop.searching.kin import TIME, drivers, explained_by_courses
 from magtensor.loop.searching.profiling import REFINING_SAMPLES, thinned
@@ -36,6 +37,7 @@ FIRST_LEFT = 2 * COURSES  # the lowest cosine frequency at which they leave the 
 SEEN = 1e-3  # probability that noise makes a channel explain as much beside them
 MORE = 1e-5  # the same of them beside a channel: slow noise is not known to better than that
 MORE_OF_ITS_OWN = 2.0  # times what they explain beside a channel that it explains beside them, if both do
+OF_ITS_OWN = 0.05  # of what a channel explains, that they do not: less than a quarter of its size
 MISSED = 0.1  # of the sum of squares, by the law of a drift: a third of its size, as a line misses of what slows down
 THE_FIELD = "the field"  # no channel has that name
 STEP = 0.01  # of a setting, over which the change of what it explains is taken
@@ -58,13 +60,63 @@ def beside_time(candidate: Candidate, state: State) -> BesideTime:
     """What smooth courses of time in the place of its channel say of a candidate, or of the field if it lags that; of
     one without either nothing."""
     before, model = candidate.before or state, candidate.model
+    theta = candidate.assessment.theta[-candidate.terms.count :]
+    compared = None if candidate.moved is not None else _compared(model, theta, before)
+    if compared is None or compared.seen:
+        return BesideTime(True)
+    x, name = before.excitation, compared.name
+    if candidate.assessment.gain.total <= MISSED * explained_by_courses(state, candidate):
+        return BesideTime(False, f"{name} explains nothing beside smooth courses of time, and a drift is adopted")
+    if compared.of_time:
+        return BesideTime(False, f"smooth courses of time explain more than {name}, and leave it nothing")
+    if name != THE_FIELD and hardly_begun(model, x):
+        return BesideTime(
+            False, f"{name}, seen through a lag of more than half of the survey, is a drift like any other"
+        )
+    return BesideTime(False)
+
+
+def outweighed(state: State, which: int) -> str:
+    """Why an adopted response is one of those courses after all, now that its form and settings are at their best: they
+    explain about as much beside it as it does beside them; "" where they do not, and where much of what it explains is
+    its own: then they are of another effect."""
+    compared = _compared(state.adopted[which], state.theta[which], put_back_one(state, which))
+    if compared is None or not compared.of_time or compared.channel > OF_ITS_OWN * compared.whole:
+        return ""
+    if compared.channel > MORE_OF_ITS_OWN * compared.time:
+        return ""
+    return f"fitted, smooth courses of time explain as much beside {compared.name} as it does beside them"
+
+
+@dataclass(frozen=True)
+class _Compared:
+    """What a response and smooth courses of time explain beside each other.
+
+    Attributes:
+        name: what it follows.
+        channel, time: squares that it explains beside them, and they beside it, more than noise would.
+        whole: that it explains without them.
+        seen, of_time: whether noise would not.
+    """
+
+    name: str
+    channel: float
+    time: float
+    whole: float
+    seen: bool
+    of_time: bool
+
+
+def _compared(model: Adopted, theta: Array, before: State) -> _Compared | None:
+    """A response with coefficients, and courses in the place of its channel, each beside the other and what is given;
+    None of what follows neither one channel nor the field."""
     x = before.excitation
     name = _followed(model, x)
-    if not name or candidate.moved is not None:
-        return BesideTime(True)
+    if not name:
+        return None
     residual, given = thinned(before, REFINING_SAMPLES)
     held = [] if given is None else [given]
-    own = _with_slopes(candidate, x).at(residual.samples)
+    own = _with_slopes(model, theta, x).at(residual.samples)
     courses = _of_time(model, x, name).at(residual.samples)
     every = joined([*held, own, courses])
     left = taken_off(residual, every, estimated(residual, every, WHITE).theta)
@@ -75,21 +127,16 @@ def beside_time(candidate: Candidate, state: State) -> BesideTime:
     def explains(seen: Residual, *terms: Terms) -> float:
         return explained(estimated(seen, joined([*held, *terms]), colours))
 
-    channel_beside = explains(residual, own, courses) - explains(residual, courses)
-    time_beside = explains(between, own, courses) - explains(between, own)
-    of_time = _chance(time_beside, courses.count) < MORE
-    told = channel_beside - own.count > MORE_OF_ITS_OWN * (time_beside - courses.count)
-    if _chance(channel_beside, own.count) < SEEN and (told or not of_time):
-        return BesideTime(True)
-    if candidate.assessment.gain.total <= MISSED * explained_by_courses(state, candidate):
-        return BesideTime(False, f"{name} explains nothing beside smooth courses of time, and a drift is adopted")
-    if of_time:
-        return BesideTime(False, f"smooth courses of time explain more than {name}, and leave it little")
-    if name != THE_FIELD and hardly_begun(model, x):
-        return BesideTime(
-            False, f"{name}, seen through a lag of more than half of the survey, is a drift like any other"
-        )
-    return BesideTime(False)
+    channel = explains(residual, own, courses) - explains(residual, courses)
+    time = explains(between, own, courses) - explains(between, own)
+    return _Compared(
+        name,
+        channel - own.count,
+        time - courses.count,
+        explains(residual, own) - (explains(residual) if held else 0.0),
+        _chance(channel, own.count) < SEEN,
+        _chance(time, courses.count) < MORE,
+    )
 
 
 def rivals_in_time(candidate: Candidate, possible: Sequence[Candidate], state: State) -> set[str]:
@@ -107,10 +154,9 @@ def _followed(model: Adopted, x: Excitation) -> str:
     return "" if others else name
 
 
-def _with_slopes(candidate: Candidate, x: Excitation) -> Terms:
-    """A candidate's terms, and how what they explain changes with its settings on a range, which are not at their best
+def _with_slopes(model: Adopted, theta: Array, x: Excitation) -> Terms:
+    """A model's terms, and how what they explain changes with its settings on a range, which are not at their best
     yet: a thousandth of them is more than noise beside a large effect."""
-    model, theta = candidate.model, candidate.assessment.theta[-candidate.terms.count :]
     outputs = 3 * len(x.sensors)
     here = model.terms(x)
     slopes = []

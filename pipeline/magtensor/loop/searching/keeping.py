@@ -24,6 +24,7 @@ from magtensor.loop.searching.contribution import (
     share_of_differences,
     share_of_the_field,
 )
+from magtensor.loop.searching.course_of_time import outweighed
 from magtensor.loop.searching.gates import Candidate
 from magtensor.loop.searching.left_out import better_left_out
 from magtensor.loop.searching.likeness import event_along
@@ -123,6 +124,8 @@ def why_not(record: Record, before: Trial, after: Trial, chosen: Candidate, how:
     if how.nominal is not None and (share := share_of_the_field(after.state, which)) > how.nominal.scale:
         # what C takes back of it keeps it from being seen
         return f"fitted, it makes {share:.0%} of the field: more than is assumed of a sensor"
+    if chosen.moved is None and (why := outweighed(after.state, which)):
+        return why
     if not before.likelier(after):
         return "fitted together with the others, it leaves more than it takes away"
     theta = chosen.assessment.theta[-chosen.terms.count :]
