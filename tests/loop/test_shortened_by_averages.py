@@ -85,8 +85,10 @@ def test_what_is_late_beside_it_makes_the_array_no_later(tmp_path: Path) -> None
     hand = {"type": "limited_tilt", "duration_s": 250.0, "tilt_deg": 40.0}
     found = magtensor.close_loop(survey_file(tmp_path, scenario(44, *effects, rate_Hz=10.0, motion=hand)), search=TURNS)
     adopted = {a["error_model"]: a for a in found.verdict["adopted"]}
-    assert set(adopted) == {"averaging", "sampling_lag"}
-    lags = [c["value"] for c in adopted["sampling_lag"]["coefficients"]]
+    late = next(a for a in found.verdict["adopted"] if a["error_model"] != "averaging")
+    assert "sampling_lag" in (late["error_model"], *late["indistinguishable_from"])  # a filter of a ms is the same
+    assert len(adopted) == 2
+    lags = [c["value"] for c in late["coefficients"]]
     assert abs(np.mean(lags)) < 0.1 * np.std(lags)
     assert adopted["averaging"]["coefficients"][0]["value"] == pytest.approx(spread, rel=0.05)
 

@@ -13,7 +13,7 @@ from magtensor.error_models.terms import Terms, joined
 from magtensor.loop.evidence.assessment import BORNE_OUT, Assessment
 from magtensor.loop.evidence.lone_event import MOST_LEFT
 from magtensor.loop.evidence.residual import Residual, taken_off
-from magtensor.loop.fitting.model import Adopted, State
+from magtensor.loop.fitting.model import Adopted, State, turning
 from magtensor.loop.searching.contribution import a_tone, happens_once
 
 ALPHA = 0.005  # family-wise probability that a clean survey gets an adoption, before the second gate
@@ -95,7 +95,10 @@ class Candidate:
     @property
     def of_no_blocks(self) -> bool:
         """Whether it predicts far more than it explains: what is adopted cannot be known from the other blocks, and
-        errs by so much without it on those that are held out."""
+        errs by so much without it on those that are held out. Not of what follows the turning: a delay that all
+        sensors share is hardly known from any blocks, and takes up all that shortens the field."""
+        if turning(self.model.component):
+            return False
         estimate = self.assessment.estimate
         explained = estimate.explained_beside(len(estimate.theta) - self.terms.count)
         return 0.0 < FAR_MORE * explained < self.assessment.gain.total
