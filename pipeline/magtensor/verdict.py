@@ -89,7 +89,8 @@ def sentence(outcome: dict[str, Any]) -> str:
     left = outcome["unexplained"]
     if adopted:
         falls, held_out = _falls(before, after), outcome["error"].get("held_out") or {}
-        if not falls and not _clearly_worse(before, after) and _falls(held_out.get("before"), held_out.get("after")):
+        shown_there = bool(held_out.get("after")) and _falls(held_out["before"], held_out["after"])
+        if not falls and shown_there and not _clearly_worse(before, after):
             falls = True
             shown = _figures(held_out["before"], held_out["after"])
             told = f"{shown} on held-out blocks{noise}; the errors {where} do not show it: {figures}"

@@ -182,7 +182,7 @@ def test_what_another_survey_does_not_show_is_told_by_held_out_blocks(verified: 
     def block(error: float) -> dict[str, Any]:
         return {"total_field_rms_nT": {"all": error}, "tensor_rms_nT_per_m": None}
 
-    outcome = {
+    outcome: dict[str, Any] = {
         "declared": ["linear"],
         "adopted": [{"error_model": "lag_step", "settings": {}, "kind": "instrument"}],
         "noise_floor_nT": 0.15,
@@ -194,6 +194,8 @@ def test_what_another_survey_does_not_show_is_told_by_held_out_blocks(verified: 
         },
     }
     assert head in sentence(outcome)
+    outcome["error"] = {**outcome["error"], "held_out": None}
+    assert "No error falls" in sentence(outcome)
 
 
 def test_what_was_adopted_more_than_once_is_counted_and_a_channel_named() -> None:
