@@ -90,7 +90,8 @@ def sentence(outcome: dict[str, Any]) -> str:
     if adopted:
         falls, held_out = _falls(before, after), outcome["error"].get("held_out") or {}
         shown_there = bool(held_out.get("after")) and _falls(held_out["before"], held_out["after"])
-        if not falls and shown_there and not _clearly_worse(before, after):
+        absent = not _clearly_worse(before, after) and not _clearly_worse(held_out.get("after"), after, DISAGREES)
+        if not falls and shown_there and absent:
             falls = True
             shown = _figures(held_out["before"], held_out["after"])
             told = f"{shown} on held-out blocks{noise}; the errors {where} do not show it: {figures}"
@@ -124,8 +125,8 @@ def _falls(before: dict[str, Any] | None, after: dict[str, Any] | None) -> bool:
     return not known or any(_of_all(after or {}, key) <= _of_all(before or {}, key) for key in known)
 
 
-def _clearly_worse(before: dict[str, Any] | None, after: dict[str, Any]) -> bool:
-    return any(_of_all(after, key) > WORSE * _of_all(before or {}, key) > 0.0 for key in ERRORS)
+def _clearly_worse(before: dict[str, Any] | None, after: dict[str, Any], times: float = WORSE) -> bool:
+    return any(_of_all(after, key) > times * _of_all(before or {}, key) > 0.0 for key in ERRORS)
 
 
 def _named(adopted: Sequence[Mapping[str, Any]]) -> list[str]:

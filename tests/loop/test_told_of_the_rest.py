@@ -194,8 +194,9 @@ def test_what_another_survey_does_not_show_is_told_by_held_out_blocks(verified: 
         },
     }
     assert head in sentence(outcome)
-    outcome["error"] = {**outcome["error"], "held_out": None}
-    assert "No error falls" in sentence(outcome)
+    of_its_own = {"before": block(1.20), "after": block(1.21)}  # another error, which no block of the first shows
+    assert "No error falls" in sentence({**outcome, "error": {**outcome["error"], "verify": of_its_own}})
+    assert "No error falls" in sentence({**outcome, "error": {**outcome["error"], "held_out": None}})
 
 
 def test_what_was_adopted_more_than_once_is_counted_and_a_channel_named() -> None:
