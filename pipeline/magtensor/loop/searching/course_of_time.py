@@ -24,7 +24,7 @@ from magtensor.error_models.terms import Terms, joined
 from magtensor.loop.evidence.assessment import WHITE, colours_of, estimated, explained
 from magtensor.loop.evidence.residual import Residual, taken_off
 from magtensor.loop.fitting.log_noise import channels_of
-from magtensor.loop.fitting.model import Adopted, State
+from magtensor.loop.fitting.model import Adopted, State, generic
 from magtensor.loop.searching.beginnings import beginning, one_pattern
 from magtensor.loop.searching.contribution import happens_once, put_back_one
 from magtensor.loop.searching.gates import Candidate
@@ -79,7 +79,10 @@ def beside_time(candidate: Candidate, state: State) -> BesideTime:
 def outweighed(state: State, which: int) -> str:
     """Why an adopted response is one of those courses after all, now that its form and settings are at their best: they
     explain about as much beside it as it does beside them; "" where they do not, and where much of what it explains is
-    its own: then they are of another effect."""
+    its own: then they are of another effect. Of a model that names its effect they may be a second time constant, or a
+    drift beside it, that is found next."""
+    if not generic(state.adopted[which]):
+        return ""
     compared = _compared(state.adopted[which], state.theta[which], put_back_one(state, which))
     if compared is None or not compared.of_time or compared.channel > OF_ITS_OWN * compared.whole:
         return ""
