@@ -14,6 +14,8 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from magtensor.in_a_row import in_a_row
+
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 Course = Literal["pchip", "spline", "linear"]
@@ -47,7 +49,7 @@ def course(time: Floats, values: Floats, how: Course) -> Callable[[Floats], Floa
     if how == "pchip":
         return monotone
     pieces = np.array(monotone.c)
-    for first, last in _runs(~breaks(time, values)):
+    for first, last in in_a_row(~breaks(time, values)):  # as many readings as intervals, and one
         if last - first + 1 >= LEAST_PIECE:
             own = slice(first, last + 1)
             pieces[:, first:last] = CubicSpline(time[own], values[own]).c
@@ -97,12 +99,6 @@ def breaks(time: Floats, values: Floats) -> Bools:
     usual = np.sqrt(np.mean(np.sort(off**2)[: -(-len(off) * 9 // 10)]))
     out: Bools = (off > ABRUPT * usual) | (steps > UNEVEN * np.median(steps))
     return out
-
-
-def _runs(some: Bools) -> list[tuple[int, int]]:
-    """The first and last reading of each run of unbroken intervals (N - 1,)."""
-    edges = np.flatnonzero(np.diff(np.concatenate(([0], some.astype(int), [0]))))
-    return list(zip(edges[0::2].tolist(), edges[1::2].tolist(), strict=True))
 
 
 def noise_gain(how: Course, place: Floats) -> Floats:

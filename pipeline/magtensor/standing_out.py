@@ -13,6 +13,7 @@ import numpy as np
 from magtensor.calibration.joint_together import FALSE_REJECTION, LEAST_FOR_REJECTION
 from magtensor.calibration.types import Array, ArrayCalibration, Mask
 from magtensor.error_models.waveform import free_directions
+from magtensor.in_a_row import in_a_row
 from magtensor.survey.flags import flag_ranges
 from magtensor.survey.model import Survey
 from magtensor.tensor.geometry import array_design
@@ -83,8 +84,7 @@ def standing_out(parts: list[Array], gradient: Array | None = None) -> Mask:
     """
     found = _beyond_noise(parts, gradient, np.zeros(len(parts[0]), dtype=bool))
     out = found & _beyond_noise(parts, gradient, found)  # one of the first round may have had such neighbours
-    edges = np.flatnonzero(np.diff(np.concatenate(([0], out.astype(int), [0]))))
-    for start, stop in zip(edges[0::2], edges[1::2], strict=True):
+    for start, stop in in_a_row(out):
         if stop - start > LONGEST:
             out[start:stop] = False
     return out

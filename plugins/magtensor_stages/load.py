@@ -13,7 +13,7 @@ from magtensor.components import stage
 from magtensor.errors import DataError, NotEnoughData, UsageError, did_you_mean
 from magtensor.survey import checks, recorded_numbers, repeated, time_base
 from magtensor.survey.flags import Flag, flag_ranges
-from magtensor.survey.misread import misread
+from magtensor.survey.lone_readings import lone_readings
 from magtensor.survey.model import AXES, Survey
 from magtensor.units import TEMPERATURE, UNITS
 
@@ -77,7 +77,7 @@ def load(
     if len(found.time) < 2:
         raise NotEnoughData("a single sample is no survey", where=where)
     found = _without_fill_values(found, notes)
-    found = _without_misreadings(found, notes)
+    found = _without_lone_readings(found, notes)
     found, impossible = _without_impossible(found)
     _refuse_faults(found, magnitude, copied_axes, where)
     _judge_position(found, magnitude, where, notes)
@@ -282,7 +282,7 @@ def _without_fill_values(survey: Survey, notes: list[str]) -> Survey:
     return survey.merged(filled) if filled else survey
 
 
-def _without_misreadings(survey: Survey, notes: list[str]) -> Survey:
+def _without_lone_readings(survey: Survey, notes: list[str]) -> Survey:
     """The survey with readings of logged channels that cannot be made missing; vectors, which feel a shock, as read."""
     from magtensor.loop.fitting.record import channels_of
 
@@ -292,7 +292,7 @@ def _without_misreadings(survey: Survey, notes: list[str]) -> Survey:
         if "axis" in survey[name].dims:
             continue
         known = UNITS.get(units[name])
-        found = misread(values, slow=known is not None and known.dimension == TEMPERATURE)
+        found = lone_readings(values, slow=known is not None and known.dimension == TEMPERATURE)
         if found.any():
             seen = np.unique(values[found])
             which = f"{seen[0]:.6g}" if len(seen) == 1 else f"{seen[0]:.6g} to {seen[-1]:.6g}"

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from magtensor.calibration.types import Array
+from magtensor.in_a_row import in_a_row
 from magtensor.report.clock import clock
 from magtensor.report.drawing import WASH, colour, label, panels
 
@@ -73,5 +74,4 @@ def _runs(flags: Sequence[Mapping[str, Any]], origin: float, scale: float, span:
         first, last = ((float(flag[k]) - origin) / scale / span * SLOTS for k in ("start", "stop"))
         if np.isfinite([first, last]).all():
             filled[int(np.clip(first, 0, SLOTS - 1)) : int(np.clip(last, 0, SLOTS - 1)) + 1] = True
-    edges = np.flatnonzero(np.diff(np.concatenate(([False], filled, [False])).astype(np.int8)))
-    return [(a / SLOTS * span, (b - a) / SLOTS * span) for a, b in edges.reshape(-1, 2)]
+    return [(a / SLOTS * span, (b - a) / SLOTS * span) for a, b in in_a_row(filled)]

@@ -8,6 +8,8 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from magtensor.in_a_row import in_a_row
+
 MUCH = 0.1  # of a survey's samples: a loss that is told at once
 
 
@@ -47,8 +49,7 @@ def flag_ranges(
         sensor: name, "" for the whole array.
         most: runs recorded singly.
     """
-    edges = np.flatnonzero(np.diff(np.concatenate(([False], bad, [False])).astype(np.int8)))
-    starts, stops = edges[0::2], edges[1::2]
+    starts, stops = in_a_row(bad).T
     flags = [
         Flag(float(time[a]), float(time[b - 1]), int(b - a), sensor, by, reason)
         for a, b in zip(starts[:most], stops[:most], strict=True)

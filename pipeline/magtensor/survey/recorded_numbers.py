@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from magtensor.in_a_row import in_a_row
+
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
@@ -56,8 +58,8 @@ def runs(equal: Bools) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     Returns:
         starts (R,) and lengths (R,), only runs of at least two samples.
     """
-    edges = np.flatnonzero(np.diff(np.concatenate(([False], equal, [False])).astype(np.int8)))
-    return edges[0::2], edges[1::2] - edges[0::2] + 1
+    starts, stops = in_a_row(equal).T
+    return starts, stops - starts + 1
 
 
 def believable_run(count: int, repeats: float, least: float = 10.0) -> float:

@@ -14,14 +14,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from magtensor.calibration.joint import JointFit
 from magtensor.calibration.joint_together import ABOUT, FALSE_REJECTION, MOSTLY, among_their_like
 from magtensor.calibration.types import Array, Mask
+from magtensor.in_a_row import in_a_row
 from magtensor.loop.evidence.folds import FOLDS
 from magtensor.loop.evidence.residual import residual_of
 
@@ -130,7 +129,7 @@ def louder_in(keep: Mask, parts: Sequence[tuple[int, Array]]) -> Mask:
         limit = chdtri(freedom, FALSE_REJECTION / (count * len(parts))) / chdtri(freedom, 0.5)
         good &= own <= limit * np.maximum(level, np.median(its))
     out = keep | good
-    for first, end in _runs(among_their_like(~keep)):
+    for first, end in in_a_row(among_their_like(~keep)):
         if end - first > ABOUT and np.mean(out[first:end]) < MOSTLY:
             out[first:end] = False
     return out
@@ -165,12 +164,7 @@ def borne_out_in(keep: Mask, parts: Sequence[tuple[int, Array]]) -> Mask:
         good &= square <= limit * np.median(square)
     out = keep | good
     doubtful = median_filter((~keep).astype(np.uint8), size=NEIGHBOURS, mode="nearest")
-    for first, end in _runs(doubtful):
+    for first, end in in_a_row(doubtful):
         if end - first > count / FOLDS:
             out[first:end] = True
     return out
-
-
-def _runs(some: NDArray[Any]) -> NDArray[np.int_]:
-    """(K, 2) where each run of some samples (N,) begins and ends."""
-    return np.flatnonzero(np.diff(some.astype(int), prepend=0, append=0)).reshape(-1, 2)

@@ -12,6 +12,7 @@ from magtensor.calibration.by_sensor import by_sensor
 from magtensor.calibration.joint import JointFit, nearest_frame
 from magtensor.calibration.types import Array
 from magtensor.error_models.excitation import Excitation
+from magtensor.in_a_row import in_a_row
 from magtensor.loop.fitting.model import Adopted, Record, of_the_site
 
 LONGEST = 5  # samples that are disturbed one after the other, over which the field is seen from those beside them
@@ -54,8 +55,7 @@ def over_disturbances(b: Array, keep: NDArray[np.bool_], time: Array, run: NDArr
     ----------
     keep: (N,) samples that the fit believes; time: (N,) s; run: (N,) number of the contiguous run.
     """
-    edges = np.flatnonzero(np.diff(np.concatenate(([False], ~keep, [False])).astype(np.int8)))
-    starts, stops = edges[0::2], edges[1::2]
+    starts, stops = in_a_row(~keep).T
     short = (stops - starts <= LONGEST) & (starts >= BESIDE) & (stops + BESIDE <= len(keep))
     starts, stops = starts[short], stops[short]
     inside = run[np.maximum(starts - BESIDE, 0)] == run[np.minimum(stops + BESIDE, len(run)) - 1]

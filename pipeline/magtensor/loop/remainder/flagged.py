@@ -8,6 +8,7 @@ import numpy as np
 
 from magtensor.calibration.types import Mask
 from magtensor.error_models.excitation import Excitation
+from magtensor.in_a_row import in_a_row
 from magtensor.loop.evidence.own_noise import OwnNoise
 from magtensor.loop.evidence.residual import residual_of
 from magtensor.loop.fitting.log_noise import channels_of
@@ -28,8 +29,7 @@ def lasting(bad: Mask, excused: Mask | None = None, longest: int = LONGEST_SPIKE
     """(N,) samples in runs of bad ones that are longer than a spike and its neighbour, or so many samples, and hold
     none that is excused."""
     out = np.zeros(len(bad), dtype=bool)
-    edges = np.flatnonzero(np.diff(np.concatenate(([0], bad.astype(int), [0]))))
-    for start, stop in zip(edges[0::2], edges[1::2], strict=True):
+    for start, stop in in_a_row(bad):
         out[start:stop] = stop - start > longest and (excused is None or not excused[start:stop].any())
     return out
 
@@ -107,7 +107,7 @@ def flagged_words(
     between readings of a base station that is read too seldom."""
     raw, reference = without(record, [a.terms(state.excitation) for a in state.adopted], state.theta)
     every = residual_of(replace(state.fit, keep=np.ones(len(flagged), dtype=bool)), raw, reference)
-    runs = int(np.sum(np.diff(np.concatenate(([0], flagged.astype(int)))) == 1))
+    runs = len(in_a_row(flagged))
     after = record.time[flagged] - record.start
     shared = 0.0 if every.along is None else float(np.mean(every.along[flagged] ** 2))
     own, alike = np.zeros(1), False

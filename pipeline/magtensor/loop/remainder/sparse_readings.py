@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from magtensor.calibration.types import Array, Mask
+from magtensor.in_a_row import in_a_row
 from magtensor.loop.fitting.model import Record, State
 
 ALPHA = 0.001
@@ -44,7 +45,7 @@ class SparseReadings:
     def between_readings(self, some: Mask, record: Record) -> bool:
         """Whether each run of some samples (N,) lies between two readings."""
         assert record.station is not None
-        edges = np.flatnonzero(np.diff(np.concatenate(([0], some.astype(int), [0])))).reshape(-1, 2)
+        edges = in_a_row(some)
         before = np.searchsorted(record.station.time, record.time, side="right")
         return bool((before[edges[:, 0]] == before[edges[:, 1] - 1]).all())
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from magtensor.in_a_row import in_a_row
 from magtensor.survey.recorded_numbers import Bools, Floats, runs
 
 INNER = 0.02  # of the rows at either end of what a log holds, beyond the usual
@@ -19,7 +20,7 @@ LEAST_ROWS = 50
 STEADY = 0.5  # mean square of the changes over that of white noise: a log has a course that a reading can depart from
 
 
-def misread(values: Floats, *, slow: bool = False) -> Bools:
+def lone_readings(values: Floats, *, slow: bool = False) -> Bools:
     """Where a log holds a reading that cannot be.
 
     Never of a log that is mostly noise, or constant but for what stands out: nothing tells a mistake from a pulse.
@@ -51,7 +52,7 @@ def _of_one(values: Floats, slow: bool) -> Bools:
     if np.mean(np.diff(others) ** 2) > STEADY * 2.0 * np.var(others):
         return out
     longest = len(read) if slow else LONGEST * _usual_run(others)
-    for a, b in _stretches(far):
+    for a, b in in_a_row(far):
         if a > 0 and b < len(read) and b - a <= longest:
             out[known[a:b]] = True
     return out
@@ -61,9 +62,3 @@ def _usual_run(values: Floats) -> float:
     """Rows for which a log keeps a value, at half of its rows."""
     _, lengths = runs(np.diff(values) == 0.0)
     return float(np.median(np.repeat(lengths, lengths))) if 2 * lengths.sum() > len(values) else 1.0
-
-
-def _stretches(some: Bools) -> list[tuple[int, int]]:
-    """The first row of each stretch and the one after its last."""
-    edges = np.flatnonzero(np.diff(np.concatenate(([0], some.astype(int), [0]))))
-    return list(zip(edges[0::2].tolist(), edges[1::2].tolist(), strict=True))

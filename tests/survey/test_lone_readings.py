@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from magtensor.survey.misread import misread
+from magtensor.survey.lone_readings import lone_readings
 
 Array = np.ndarray[Any, Any]
 ROWS = 6000
@@ -41,33 +41,33 @@ def test_what_a_bus_answers_when_a_thermometer_does_not() -> None:
     values = thermometer()
     at = [400, 2711, 2712, 5100]
     values[at] = [85.0, -127.0, -127.0, 85.0]
-    assert np.flatnonzero(misread(values)).tolist() == at
+    assert np.flatnonzero(lone_readings(values)).tolist() == at
 
 
 def test_a_temperature_does_not_jump_and_come_back() -> None:
     values = np.round((21.0 + 4.0 * np.sin(np.arange(ROWS) / 900.0)) * 16.0) / 16.0 + 0.1 * rng().standard_normal(ROWS)
     values[3000:3030] = 85.0
-    assert np.flatnonzero(misread(values, slow=True)).tolist() == list(range(3000, 3030))
-    assert not misread(values).any()  # of anything else that may be
+    assert np.flatnonzero(lone_readings(values, slow=True)).tolist() == list(range(3000, 3030))
+    assert not lone_readings(values).any()  # of anything else that may be
 
 
 def test_a_reading_that_is_held_until_the_next() -> None:
     values = held(thermometer() + 0.01 * rng().standard_normal(ROWS), 10)
     values[3000:3010] = 85.0
-    assert np.flatnonzero(misread(values)).tolist() == list(range(3000, 3010))
+    assert np.flatnonzero(lone_readings(values)).tolist() == list(range(3000, 3010))
 
 
 def test_a_lost_bit_of_a_current() -> None:
     values = current()
     values[1234] += 128.0
-    assert np.flatnonzero(misread(values)).tolist() == [1234]
+    assert np.flatnonzero(lone_readings(values)).tolist() == [1234]
 
 
 def test_one_of_several_thermometers_and_gaps() -> None:
     values = np.column_stack([thermometer(), thermometer() + 3.0])
     values[100:200] = np.nan
     values[2000, 1] = 85.0
-    assert np.argwhere(misread(values)).tolist() == [[2000, 1]]
+    assert np.argwhere(lone_readings(values)).tolist() == [[2000, 1]]
 
 
 def pulses(values: Array, size: float, every: int = 500) -> Array:
@@ -98,4 +98,4 @@ def during(values: Array, first: int, last: int, value: float) -> Array:
     ],
 )
 def test_a_course_that_is_none(make: Callable[[], Array]) -> None:
-    assert not misread(make()).any()
+    assert not lone_readings(make()).any()
