@@ -102,7 +102,7 @@ def too_loud_in(values: Array, affine: Array, effects: Sequence[Array] = ()) -> 
     if not found[best] <= WORTH_IT * found[-1]:
         return out
     loud = median_filter((level > limits[best]).astype(int), size=ABOUT, mode="nearest")
-    for first, end in _runs(loud):
+    for first, end in in_a_row(loud):
         out[first:end] = end - first >= LEAST_LOUD
     for square in effects:
         if level[~out] @ square[~out] * square.sum() ** 2 > level @ square * square[~out].sum() ** 2:
