@@ -120,6 +120,11 @@ def colours_without(trial: Trial) -> Colours:
     return colours_of(joint_state(recorded(simulated(trial)), [], Fitting()).residual)
 
 
+def delay_s(simulation: Simulated) -> float:
+    """By how much the time stamps of the base station are late, s, where that is the effect."""
+    return float(np.ravel(next(iter(simulation.truth.effects[0].coefficients.values())))[0])
+
+
 def oracle(trial: Trial, simulation: Simulated, record: Record, state: State) -> float | None:
     """The p value of the effect alone with its right settings; None where these cannot be known."""
     from scipy.stats import chi2
@@ -130,7 +135,7 @@ def oracle(trial: Trial, simulation: Simulated, record: Record, state: State) ->
     if trial.effect in ("offset_drift", "reference_drift", "scale_drift"):
         settings["span_s"] = float(np.ptp(record.time))
     if trial.effect == "reference_clock":
-        settings["lag_s"] = float(np.ravel(next(iter(simulation.truth.effects[0].coefficients.values())))[0])
+        settings["lag_s"] = delay_s(simulation)
     terms = models()[trial.effect].function(state.excitation, **settings).at(state.residual.samples)
     known = colours_without(trial._replace(effect="", amplitude=0.0))
     colours = known.among(state.residual)
@@ -187,6 +192,8 @@ def tried(trial: Trial) -> dict[str, Any]:
     try:
         simulation = simulated(trial)
         record = recorded(simulation)
+        if trial.effect == "reference_clock" and abs(delay_s(simulation)) > np.ptp(record.time):
+            return row | {"outcome": "cannot be", "why": "the delay is longer than the survey and all its readings"}
         state = joint_state(record, [], Fitting())
         row["oracle"] = oracle(trial, simulation, record, state)
         if row["oracle"] is not None:

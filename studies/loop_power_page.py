@@ -129,7 +129,7 @@ def by_effect(rows: Sequence[Row]) -> Iterator[str]:
     yield (
         "In brackets: what was adopted, where it is not the effect itself. An asterisk: the oracle does not find it "
         "either; a plus: not the one that pays for what was tried. A dash: not run, or no such survey can be simulated "
-        "(delays of a minute to be as large as asked)."
+        "(delays of a minute, or longer than the survey, to be as large as asked)."
     )
     yield ""
     columns = sorted({(r["motion"], r["noise"], r["amplitude"]) for r in rows}, key=lambda c: (c[1], c[0], c[2]))
