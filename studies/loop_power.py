@@ -76,6 +76,7 @@ RIGHT: dict[str, dict[str, Any]] = {
     "offset_while": {"time_s": 600.0, "until_s": 1000.0},
     "scale_step": {"time_s": 1000.0},
     "turn_step": {"time_s": 1000.0},
+    "calibration_step": {"time_s": 1000.0},
     "temperature_alignment": {"channel": "temperature"},
     "alignment_drift": {"tau_s": 600.0},
     "sampling_lag": {"per_axis": True},

@@ -1,6 +1,14 @@
 """Built-in error models: the catalogue of docs/error_models.md."""
 
-from magtensor_effects.ageing import offset_drift, offset_step, offset_while, scale_drift, scale_step, warm_up
+from magtensor_effects.ageing import (
+    calibration_step,
+    offset_drift,
+    offset_step,
+    offset_while,
+    scale_drift,
+    scale_step,
+    warm_up,
+)
 from magtensor_effects.channels import channel_response, moving_part, periodic_interference
 from magtensor_effects.geometry import baseline_expansion, finite_baseline, position_error
 from magtensor_effects.inertia import (
@@ -31,6 +39,7 @@ __all__ = [
     "averaging",
     "bandwidth",
     "baseline_expansion",
+    "calibration_step",
     "channel_response",
     "clock_drift",
     "cross_field",

@@ -157,3 +157,20 @@ def scale_step(x: Excitation, *, time_s: EventTime = 0.0, of_field: OfField = Fa
     for a jump in the middle of a short survey, `offset_step` where the attitude hardly changes.
     """
     return x.scales(np.where(x.elapsed >= time_s, 1e-6, 0.0), "ppm", of_field=of_field)
+
+
+@error_model(
+    "instrument",
+    source="jump of C and o as a whole",
+    typical="per mille to per cent: two sensors changed places, one was put back or replaced, an axis lost a turn",
+    pointwise=True,
+)
+def calibration_step(x: Excitation, *, time_s: EventTime = 0.0) -> Terms:
+    """Each sensor has another C and another offset from a time on: what reads it is another sensor, or it was changed.
+
+    Twelve coefficients a sensor: what every axis shows more of the sensor's own three outputs, and a jump of its
+    offset; it is exact however large the change is. Rivals, with fewer coefficients: `offset_step`, `scale_step`, and
+    `turn_step` for turns so small that their square does not show.
+    """
+    since = (x.elapsed >= time_s).astype(float)
+    return joined([x.offsets(since, "nT"), x.matrices(1e-6 * since[:, None, None] * x.output, "ppm")])

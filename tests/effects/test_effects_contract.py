@@ -25,7 +25,7 @@ CATALOGUE = {
         "cross_field", "hysteresis", "offset_step", "sampling_lag", "eddy_current", "bandwidth", "clock_drift",
         "crosstalk", "viscous_magnetisation", "moving_part", "periodic_interference", "frame_flexure",
         "channel_response", "finite_baseline", "position_error", "baseline_expansion", "latent_source",
-        "scale_step", "turn_step", "offset_while", "lag_step", "averaging",
+        "scale_step", "turn_step", "calibration_step", "offset_while", "lag_step", "averaging",
         "temperature_alignment", "alignment_drift",
     },
     "site": {"fixed_source", "site_gradient", "passing_source"},

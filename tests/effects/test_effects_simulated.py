@@ -275,6 +275,14 @@ def test_turn_step_in_arcmin() -> None:
     np.testing.assert_allclose(per_axis(fit, survey.sensors), truth_of(survey), atol=0.01)
 
 
+def test_calibration_step_as_a_change_of_the_output() -> None:
+    """A sensor that takes the place of another: C changes by whole parts, and the offset with it."""
+    change = 0.3 * np.random.default_rng(6).standard_normal((4, 3, 3))
+    fit, survey, _ = fitted("calibration_step", {"time_s": 77.0}, {"change": change.tolist(), "time_s": 77.0})
+    assert fit.left < 1e-6
+    np.testing.assert_allclose(per_matrix(fit, survey.sensors), 1e6 * change, rtol=1e-6, atol=1e-3)
+
+
 def test_a_mount_that_turns_as_it_warms_in_arcmin_per_degree() -> None:
     effect = {"arcmin_per_degC": drawn(1), "lag_s": 40.0}
     fit, survey, _ = fitted("temperature_alignment", {"lag_s": 40.0}, effect)

@@ -37,6 +37,7 @@ EVERY: dict[str, dict[str, Any]] = {
     "offset_step": {"time_s": [20.0, 45.0]},
     "scale_step": {"time_s": [20.0, 45.0]},
     "turn_step": {"time_s": 20.0},
+    "calibration_step": {"time_s": 20.0},
     "temperature_alignment": {"lag_s": 5.0},
     "alignment_drift": {"tau_s": 20.0},
     "sampling_lag": {"per_axis": True},

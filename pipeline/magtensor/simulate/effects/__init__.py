@@ -19,6 +19,7 @@ from magtensor.simulate.effects.electronics import (
 from magtensor.simulate.effects.geometry import BaselineExpansion, PositionError
 from magtensor.simulate.effects.platform import (
     AlignmentDrift,
+    CalibrationStep,
     ChannelResponse,
     Crosstalk,
     CurrentField,
@@ -52,6 +53,7 @@ AnyEffect = Annotated[
     | OffsetStep
     | ScaleStep
     | TurnStep
+    | CalibrationStep
     | TemperatureAlignment
     | AlignmentDrift
     | SupplyScale

@@ -270,6 +270,25 @@ class TurnStep(SensorEffectSpec):
         return _turned_by(bench, ARCMIN * coefficients, after[:, None])
 
 
+class CalibrationStep(SensorEffectSpec):
+    """A sensor is replaced by one with another C."""
+
+    COEFFICIENTS = "change"
+    type: Literal["calibration_step"]
+    change: list[Matrix3] | None = Field(None, description="K of each sensor: C becomes (1 + K) C, without dimension")
+    time_s: float = Field(description="time at which it is replaced, s since the start")
+
+    def drawn(self, bench: Bench, rng: np.random.Generator) -> Array:
+        return rng.standard_normal((bench.sensors, 3, 3))
+
+    def read(self, bench: Bench) -> Array:
+        return _matrices(self.given, bench.sensors, "effect calibration_step: change")
+
+    def waveform(self, bench: Bench, coefficients: Array) -> Array:
+        after = (bench.time >= self.time_s).astype(float)
+        return after[:, None, None] * _coupled(bench, coefficients, bench.sensed(bench.b))
+
+
 class TemperatureAlignment(LaggingTemperature):
     """The sensors turn in their mounts as these warm."""
 
