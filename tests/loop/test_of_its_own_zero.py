@@ -11,7 +11,7 @@ from loop_cases import Array, synthetic
 from magtensor.loop.fitting.model import Adopted, Fitting, Record
 from magtensor.loop.fitting.record import origin
 from magtensor.loop.fitting.refit import joint_state
-from magtensor.loop.searching.adopting import on_those_that_show
+from magtensor.loop.searching.on_fewer_sensors import on_those_that_show
 from magtensor.loop.searching.outcome import judgement
 from magtensor.loop.searching.rounds import with_lines
 from magtensor.loop.searching.screening import candidates_of

@@ -7,7 +7,7 @@ import pytest
 from loop_cases import linear_state, synthetic
 
 from magtensor.loop.fitting.model import Fitting, State
-from magtensor.loop.searching import adopting, by_hand
+from magtensor.loop.searching import adopting, by_hand, on_fewer_sensors
 from magtensor.loop.searching.adopting import adopt
 from magtensor.loop.searching.gates import ALPHA
 from magtensor.registry import Registry
@@ -47,7 +47,7 @@ def test_one_sensor_may_lose_a_little_where_a_part_of_all_is_not_seen(
     def without_others(_: State, __: int, sensors: tuple[str, ...]) -> tuple[int, int, float]:
         return 3, seen, lost if sensors == ("S2",) else 150.0
 
-    monkeypatch.setattr(adopting, "_without_others", without_others)
-    monkeypatch.setattr(adopting, "_spare", lambda *_: True)
-    monkeypatch.setattr(adopting, "sensors_showing", lambda *_: None)
-    assert adopting._needed(state, 0) == found
+    monkeypatch.setattr(on_fewer_sensors, "_without_others", without_others)
+    monkeypatch.setattr(on_fewer_sensors, "_spare", lambda *_: True)
+    monkeypatch.setattr(on_fewer_sensors, "sensors_showing", lambda *_: None)
+    assert on_fewer_sensors._needed(state, 0) == found

@@ -1,4 +1,4 @@
-"""Refit with a model that is adopted: on which of its sensors, and with its settings sought once more."""
+"""Refit with a model that is adopted, and with its settings sought once more."""
 
 from __future__ import annotations
 
@@ -10,25 +10,15 @@ import numpy as np
 
 from magtensor.error_models.settings import AsAWhole, Beginning, EventTimes, Forms, Frequencies, Range, profiled
 from magtensor.error_models.terms import Terms
-from magtensor.error_models.waveform import NAME
-from magtensor.loop.evidence.assessment import estimated, explained
 from magtensor.loop.evidence.golden import golden
 from magtensor.loop.evidence.scoring import Scorer
-from magtensor.loop.fitting.model import Adopted, Fitting, Record, State, turning
+from magtensor.loop.fitting.model import Adopted, Fitting, Record, State
 from magtensor.loop.fitting.refit import joint_state
 from magtensor.loop.fitting.separation import SEPARATION
 from magtensor.loop.searching.beginnings import beginning, extent, least_gain, with_beginning
-from magtensor.loop.searching.contribution import (
-    KEEP_ALPHA,
-    families,
-    happens_once,
-    held_out,
-    moments,
-    put_back,
-    significance_at_once,
-    slices,
-)
-from magtensor.loop.searching.gates import SECOND_ORDER, Candidate
+from magtensor.loop.searching.contribution import moments, put_back, slices
+from magtensor.loop.searching.gates import Candidate
+from magtensor.loop.searching.on_fewer_sensors import on_those_needed
 from magtensor.loop.searching.profiling import of_ratios
 from magtensor.loop.searching.split import coefficients
 
@@ -42,12 +32,6 @@ def adopt(record: Record, state: State, chosen: Candidate, how: Fitting) -> Stat
     return on_those_needed(record, on_all_sensors(record, state, chosen, how), len(state.adopted), how)
 
 
-def on_those_needed(record: Record, state: State, which: int, how: Fitting) -> State:
-    """Refit with one of the models on those of its sensors that need it."""
-    sensors = _needed(state, which)
-    return state if sensors is None else narrowed(record, state, which, sensors, how)
-
-
 def on_all_sensors(record: Record, state: State, chosen: Candidate, how: Fitting) -> State:
     """Refit with the chosen model on all its sensors, whether they show it or not."""
     models = [*state.adopted, chosen.model]
@@ -59,117 +43,6 @@ def on_all_sensors(record: Record, state: State, chosen: Candidate, how: Fitting
         moves = np.split(chosen.assessment.theta, np.cumsum([len(t) for t in state.theta]))
         start = [t + move for t, move in zip([*state.theta, np.zeros(chosen.terms.count)], moves, strict=True)]
     return joint_state(record, models, how, start)
-
-
-def narrowed(record: Record, state: State, which: int, sensors: tuple[str, ...], how: Fitting) -> State:
-    """Refit with one of the models on some of its sensors only."""
-    model = state.adopted[which]
-    models = list(state.adopted)
-    models[which] = Adopted(model.component, model.settings, sensors)
-    assert state.terms is not None
-    part = slices(state)[which]
-    keep = [i for i, s in enumerate(state.terms.sensors[part]) if s in sensors or s == ""]
-    theta = list(state.theta)
-    theta[which] = theta[which][keep]
-    return joint_state(record, models, how, theta)
-
-
-def on_those_that_show(record: Record, state: State, how: Fitting, fixed: int) -> State:
-    """Refit with every model that was found on those of its sensors that show it beside all others.
-
-    When it was adopted, what had no name yet on one sensor was in the field that all of them see, and so seemed to be a
-    little of it on each.
-    """
-    for which in range(fixed, len(state.adopted)):
-        if state.adopted[which].name == NAME or len(state.adopted) == fixed + 1:
-            continue
-        state = on_those_needed(record, state, which, how)
-    return state
-
-
-def _needed(state: State, which: int) -> tuple[str, ...] | None:
-    """The sensors on which alone a model does as well; None where it needs all that it has."""
-    sensors = sensors_showing(state, which)
-    return sensors if sensors is not None and _spare(state, which, sensors) else _sufficient(state, which)
-
-
-def _spare(state: State, which: int, sensors: tuple[str, ...], least: float = SEPARATION) -> bool:
-    """Whether a model can do without its coefficients for all but some sensors.
-
-    A coefficient may be insignificant because others can stand in for it, as where only differences between sensors
-    are seen (a delay of all of them is a turn of the field): each could go, and not several of them. All that go have
-    to predict no more on held-out blocks than what tells two models apart, or the least that is asked for.
-    """
-    gone, seen, _ = _without_others(state, which, sensors)
-    if seen < gone:
-        return False
-    gain = held_out(state, _kept(state, which, sensors))
-    return not (gain.total >= least and gain.consistent)
-
-
-def _sufficient(state: State, which: int) -> tuple[str, ...] | None:
-    """The one sensor whose coefficients explain all that a model does, where others can stand in for them.
-
-    If only differences between sensors are seen, or little else, one that turned is like all others turned the other
-    way: every coefficient is significant, or none is. None where no sensor suffices, or several do. What is not seen of
-    several sensors is shared out among them, and wrong on each: where there is such a part, one alone may lose as much
-    as does not tell two models apart. And what follows the turning may lose as much as its law may miss: by so much
-    all of them are moved together, which only the second order would tell.
-    """
-    from scipy.special import chdtri
-
-    assert state.terms is not None
-    owners = state.terms.sensors[slices(state)[which]]
-    missed = 0.0
-    if turning(state.adopted[which].component):
-        missed = SECOND_ORDER * _without_others(state, which, ())[2]
-    found = []
-    for sensor in sorted(set(owners) - {""}):
-        gone, seen, lost = _without_others(state, which, (sensor,))
-        if not seen:
-            continue
-        least = max(float(chdtri(seen, KEEP_ALPHA)), missed)
-        if lost >= (max(least, SEPARATION + seen) if seen < gone else least):
-            continue
-        if seen < gone or _spare(state, which, (sensor,), max(SEPARATION, missed)):
-            found.append(sensor)
-    return tuple(found) if len(found) == 1 else None
-
-
-def _without_others(state: State, which: int, sensors: tuple[str, ...]) -> tuple[int, int, float]:
-    """Of a model's coefficients for all but some sensors: how many, how many directions of them the survey shows, and
-    what is explained no longer without them."""
-    assert state.terms is not None
-    kept = _kept(state, which, sensors)
-    back = put_back(state.residual, state.terms, np.concatenate(state.theta))
-    every = estimated(back, state.terms, state.colours)
-    fewer = estimated(back, state.terms.only(kept), state.colours)
-    return state.terms.count - len(kept), every.rank - fewer.rank, explained(every) - explained(fewer)
-
-
-def _kept(state: State, which: int, sensors: tuple[str, ...]) -> list[int]:
-    """The numbers of all coefficients but those of a model for other sensors."""
-    assert state.terms is not None
-    part = slices(state)[which]
-    return [i for i, s in enumerate(state.terms.sensors) if not part.start <= i < part.stop or s in sensors or s == ""]
-
-
-def sensors_showing(state: State, which: int) -> tuple[str, ...] | None:
-    """Sensors whose own coefficients are significant; None where all are, or the model is not of single sensors."""
-    part = slices(state)[which]
-    assert state.terms is not None
-    owners = state.terms.sensors[part]
-    names = [s for s in state.excitation.sensors if s in owners]
-    if len(names) < 2:
-        return None
-    own = {s: [part.start + i for i, o in enumerate(owners) if o == s] for s in names}
-    if happens_once(state.adopted[which]):
-        p_values = [significance_at_once(state, own[s]) for s in names]
-    else:
-        tests = families(state)
-        p_values = [tests.p_value(own[s]) for s in names]
-    showing = [s for s, p in zip(names, p_values, strict=True) if p < KEEP_ALPHA / len(names)]
-    return tuple(showing) if showing and len(showing) < len(names) else None
 
 
 def polished(record: Record, state: State, how: Fitting) -> State:

@@ -14,7 +14,7 @@ from magtensor.loop.fitting.separation import SEPARATION, fold_gain
 from magtensor.loop.fitting.trial import Trial, on_the_folds_of, trial
 from magtensor.loop.remainder.changing_matrix import channel_instead
 from magtensor.loop.remainder.curve_of_a_channel import event_of_a_curve
-from magtensor.loop.searching.adopting import adopt, narrowed, on_all_sensors, polished
+from magtensor.loop.searching.adopting import adopt, on_all_sensors, polished
 from magtensor.loop.searching.beginnings import at_its_limit, began_with_a_vector
 from magtensor.loop.searching.contribution import (
     agrees,
@@ -28,6 +28,7 @@ from magtensor.loop.searching.course_of_time import outweighed
 from magtensor.loop.searching.gates import Candidate
 from magtensor.loop.searching.left_out import better_left_out
 from magtensor.loop.searching.likeness import event_along
+from magtensor.loop.searching.on_fewer_sensors import narrowed
 from magtensor.loop.searching.profiling import already
 from magtensor.loop.searching.rivals import hardly_begun
 

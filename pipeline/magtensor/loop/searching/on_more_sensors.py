@@ -20,8 +20,8 @@ from magtensor.loop.fitting.model import Adopted, Fitting, Record, State
 from magtensor.loop.fitting.refit import joint_state
 from magtensor.loop.fitting.separation import fold_gain, separated
 from magtensor.loop.fitting.trial import Trial, on_the_folds_of, trial
-from magtensor.loop.searching.adopting import narrowed, sensors_showing
 from magtensor.loop.searching.contribution import KEEP_ALPHA, put_back_one, slices, without_models
+from magtensor.loop.searching.on_fewer_sensors import narrowed, sensors_showing
 
 
 def on_more_sensors(record: Record, standing: Trial, how: Fitting, places: Sequence[int]) -> Trial:

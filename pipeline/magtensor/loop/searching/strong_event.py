@@ -19,10 +19,11 @@ from magtensor.components import Component
 from magtensor.errors import DataError
 from magtensor.loop.fitting.model import Adopted, Fitting, Record, State
 from magtensor.loop.fitting.refit import joint_state
-from magtensor.loop.searching.adopting import on_those_needed, polished
+from magtensor.loop.searching.adopting import polished
 from magtensor.loop.searching.found import Step
 from magtensor.loop.searching.gates import Candidate
 from magtensor.loop.searching.left_out import better_left_out
+from magtensor.loop.searching.on_fewer_sensors import on_those_needed
 from magtensor.loop.searching.own_fit import at_its_fit
 from magtensor.loop.searching.refining import refined
 
