@@ -201,6 +201,7 @@ def summary(verdict: dict[str, Any]) -> str:
         words = [
             *([settings] if settings else []),
             *([f"by a curve that bends at {', '.join(f'{b:.3g}' for b in bends)}"] if bends else []),
+            *([one["means"]] if "means" in one else []),
             *([f"most like channel {one['most_like_channel']}"] if "most_like_channel" in one else []),
             f"on {', '.join(one['sensors'])}" if one["sensors"] else "on all sensors alike",
             f"held-out residual {figure(before)} -> {figure(after)} nT",

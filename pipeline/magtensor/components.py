@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 F = TypeVar("F", bound=Callable[..., Any])
 Agrees = Callable[[Any, Mapping[str, Any], Any, float], bool]  # of an excitation, settings, coefficients, their share
+Means = Callable[[Any, Mapping[str, Any], Mapping[tuple[str, str], float]], str]  # ..., coefficients by sensor and name
 
 MARK = "__magtensor__"
 KINDS = ("stage", "method", "reader", "metric", "error_model")
@@ -82,6 +83,7 @@ class Component:
     pointwise: bool = False  # of an error model: its regressors at a sample need no other sample
     agrees: Agrees | None = None  # of an error model: what was fitted with it
     about: Callable[[Mapping[str, Any], Any], Mapping[str, Any]] | None = None  # settings that coefficients ask for
+    means: Means | None = None  # of an error model: what its coefficients say together
     several: bool = False  # of a stage: it also fits the further surveys that a recipe names
     long: Callable[..., Any] | None = None  # of a stage: what it does with a recording longer than the memory
 
@@ -267,6 +269,7 @@ def error_model(
     pointwise: bool = False,
     agrees: Agrees | None = None,
     about: Callable[[Mapping[str, Any], Any], Mapping[str, Any]] | None = None,
+    means: Means | None = None,
 ) -> Callable[[F], F]:
     """Mark ``function(x: Excitation, *, settings) -> Terms`` as an error model.
 
@@ -285,11 +288,13 @@ def error_model(
             not.
         about: of settings and fitted coefficients (P,), the settings about which a model that is linear only nearby
             has to be made for such coefficients; the loop moves there where the data allow it.
+        means: of the excitation, settings and fitted coefficients by sensor and name, what they say together and not
+            one by one, in a few words for the verdict; "" where they say nothing more.
     """
     _with_parentheses("error_model", effect)
     return _mark(
         "error_model", name, declares=Declares(tuple(needs)), effect=effect, source=source, typical=typical,
-        pointwise=pointwise, agrees=agrees, about=about,
+        pointwise=pointwise, agrees=agrees, about=about, means=means,
     )  # fmt: skip
 
 

@@ -142,6 +142,8 @@ def _with_its_channel(a: Mapping[str, Any]) -> str:
         name = f"{name} of {channel}" + (f" (or of {' or '.join(others)})" if others else "")
     if like := a.get("most_like_channel"):
         name = f"{name} (most like channel {like})"
+    if means := a.get("means"):
+        name = f"{name} ({means})"
     return f"{name} by a curve" if settings.get("bends") else name
 
 

@@ -1,12 +1,14 @@
 """Error models of time: drifts, warming up, jumps."""
 
-from typing import Annotated, Literal
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field
 
 from magtensor.calibration.types import Array
 from magtensor.components import error_model
+from magtensor.error_models.acting import AXES
 from magtensor.error_models.excitation import Excitation
 from magtensor.error_models.settings import Duration, EventTimes, Laws, Orders, Range
 from magtensor.error_models.terms import Terms, joined
@@ -29,6 +31,8 @@ Law = Annotated[
     ),
 ]
 PARTS = 100.0  # of the span, the first of which the logarithm begins with
+
+AS_ANOTHER = 0.1  # of a sensor's change: nearer than that to another sensor it is that one
 
 EventTime = Annotated[float, EventTimes(), Field(description="time of the jump, s since the survey's start")]
 
@@ -159,11 +163,32 @@ def scale_step(x: Excitation, *, time_s: EventTime = 0.0, of_field: OfField = Fa
     return x.scales(np.where(x.elapsed >= time_s, 1e-6, 0.0), "ppm", of_field=of_field)
 
 
+def _in_whose_place(x: Excitation, settings: Mapping[str, Any], found: Mapping[tuple[str, str], float]) -> str:
+    """Which sensors read from the time on what others had read before it."""
+    strength = float(np.mean(np.linalg.norm(x.field_or_fields, axis=-1)))
+    offset = x.output.mean(axis=0) - x.sensed(x.field_or_fields).mean(axis=0)
+    before = {s: np.column_stack([strength * c, o]) for s, c, o in zip(x.sensors, x.matrix, offset, strict=True)}
+    place = {}
+    for sensor in dict.fromkeys(s for s, _ in found):
+        change = np.eye(3) + 1e-6 * np.array([[found[sensor, a + b] for b in AXES] for a in AXES])
+        after = change @ before[sensor]
+        after[:, 3] += [found[sensor, a] for a in AXES]
+        apart = {s: float(np.linalg.norm(after - each)) for s, each in before.items()}
+        nearest = min(set(apart) - {sensor}, key=lambda s: apart[s], default=sensor)
+        if apart[nearest] < AS_ANOTHER * apart[sensor]:
+            place[sensor] = nearest
+    pairs = [(s, t) for s, t in place.items() if place.get(t) == s and s < t]
+    words = [f"{s} and {t} have changed places" for s, t in pairs]
+    words += [f"{s} is what {t} was" for s, t in place.items() if place.get(t) != s]
+    return f"from {settings['time_s']:.6g} s on {', '.join(words)}" if words else ""
+
+
 @error_model(
     "instrument",
     source="jump of C and o as a whole",
     typical="per mille to per cent: two sensors changed places, one was put back or replaced, an axis lost a turn",
     pointwise=True,
+    means=_in_whose_place,
 )
 def calibration_step(x: Excitation, *, time_s: EventTime = 0.0) -> Terms:
     """Each sensor has another C and another offset from a time on: what reads it is another sensor, or it was changed.

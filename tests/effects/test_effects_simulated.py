@@ -549,3 +549,21 @@ def test_every_model_is_held_to_the_simulator_here() -> None:
     source = inspect.getsource(sys.modules[__name__])
     tried = [n for n in magtensor_effects.__all__ if f'"{n}"' in source or f"magtensor_effects.{n}(" in source]
     assert tried == magtensor_effects.__all__
+
+
+def test_who_is_in_whose_place() -> None:
+    """S1, S2 and S3 in a circle, S4 replaced by a sensor that had no place before."""
+    x = excitation(simulated("offset_step", nT=[0.0, 0.0, 0.0], time_s=[50.0]))
+    offset = x.output[0] - np.einsum("sij,sj->si", x.matrix, np.broadcast_to(x.field[0], x.output[0].shape))
+    found = {}
+    for own, other in ((0, 1), (1, 2), (2, 0), (3, 3)):
+        change = x.matrix[other] @ np.linalg.inv(x.matrix[own]) + 0.004 * (own == 3)
+        jump = offset[other] - change @ offset[own]
+        for i, a in enumerate("xyz"):
+            found |= {(x.sensors[own], a + b): 1e6 * (change - np.eye(3))[i, j] for j, b in enumerate("xyz")}
+            found[x.sensors[own], a] = jump[i]
+    means = model("calibration_step").means
+    assert means is not None
+    assert means(x, {"time_s": 50.0}, found) == "from 50 s on S1 is what S2 was, S2 is what S3 was, S3 is what S1 was"
+    two = {key: value for key, value in found.items() if key[0] == "S4"}
+    assert means(x, {"time_s": 50.0}, two) == ""

@@ -97,6 +97,9 @@ def _adopted(found: Search, index: int) -> dict[str, Any]:
     beside = {a.name for a in state.adopted} - {CHANNEL}  # what was adopted beside it is told apart from it
     rivals = [] if step is None else [name for name in step.rivals if name not in beside]
     p = float("nan") if step is None or step.adopted is None else step.adopted.assessment.p
+    meaning = model.component.means
+    found_of = dict(zip(zip(sensors, names, strict=True), map(float, state.theta[index]), strict=True))
+    means = "" if meaning is None else meaning(state.excitation, model.settings, found_of)
     return {
         "error_model": model.name,
         "kind": model.component.effect,
@@ -109,6 +112,7 @@ def _adopted(found: Search, index: int) -> dict[str, Any]:
         "evidence": {"held_out_rms_before_nT": before, "held_out_rms_after_nT": after, "z": z_of(p)},
         "indistinguishable_from": rivals,
         **({"channels_as_good": list(step.channels)} if step is not None and step.channels else {}),
+        **({"means": means} if means else {}),
         **({"most_like_channel": step.like} if step is not None and step.like else {}),
     }
 

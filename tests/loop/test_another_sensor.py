@@ -1,0 +1,72 @@
+"""From one moment on a sensor has another C and offset: two changed places, or one was taken off and put back."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from loop_cases import BASE, Array, adopted_names, linear_state, scenario, synthetic, verdict_of
+from scipy.spatial.transform import Rotation
+from test_changing_matrix import turned
+
+from magtensor.loop.fitting.model import Fitting
+from magtensor.loop.searching import by_hand
+from magtensor.loop.searching.adopting import adopt
+from magtensor.loop.searching.gates import ALPHA
+from magtensor.registry import Registry
+
+FIRST = 700  # of 1200 samples, two a second
+SHORT = {"motion": BASE["motion"] | {"duration_s": 600.0}}
+STEPS = ["calibration_step", "turn_step", "scale_step", "offset_step"]
+ARCMIN = np.pi / 10800.0
+
+
+def exchanged(b: Array) -> Array:
+    return b[:, [0, 2, 1, 3]]
+
+
+def put_back(b: Array) -> Array:
+    """The second sensor as a hand puts it back: by a quarter of a degree elsewhere, and by a screw that is magnetic."""
+    out = b.copy()
+    out[:, 1] = Rotation.from_rotvec([0.003, -0.003, 0.002]).apply(b[:, 1]) + np.array([30.0, -20.0, 10.0])
+    return out
+
+
+@pytest.mark.parametrize(
+    ("change", "sensors", "models"),
+    [
+        (exchanged, ["S2", "S3"], STEPS),
+        pytest.param(put_back, ["S2"], STEPS, marks=pytest.mark.long),
+        pytest.param(exchanged, ["S2", "S3"], None, marks=pytest.mark.long),
+    ],
+)
+def test_it_is_found_with_the_sensors(
+    change: Callable[[Array], Array], sensors: list[str], models: list[str] | None, tmp_path: Path
+) -> None:
+    def changed(path: Path) -> None:
+        with h5py.File(path, "r+") as file:
+            file["b_raw"][FIRST:] = change(file["b_raw"][FIRST:])
+
+    found = verdict_of(tmp_path, scenario(4, **SHORT), changed, models)
+    assert adopted_names(found) == {"calibration_step"}
+    (step,) = found["adopted"]
+    assert step["sensors"] == sensors
+    assert step["settings"]["time_s"] == pytest.approx(FIRST / 2.0, abs=0.5)
+    assert ("S2 and S3 have changed places" in step.get("means", "")) is (change is exchanged)
+    assert found["noise_floor_nT"] == pytest.approx(0.15, abs=0.01)
+    after = found["error"]["held_out"]["after"]["total_field_rms_nT"]
+    assert max(after.values()) < 0.2
+    assert not found["unexplained"]["present"], found["unexplained"]["description"]
+
+
+@pytest.mark.parametrize("model", ["calibration_step", "turn_step"])
+@pytest.mark.parametrize("arcmin", [1.0, 60.0])
+def test_a_large_turn_is_of_the_sensor_that_turned_as_a_small_one_is(arcmin: float, model: str) -> None:
+    """Shared out among four, a turn by a degree is a turn of all by a quarter, whose square is seen: by 0.5 nT."""
+    record = turned(synthetic(3), 1, np.where(np.arange(1200) >= 700, arcmin * ARCMIN, 0.0))
+    state = linear_state(record)
+    step = by_hand.candidate(Registry.load().find("error_model", model), {"time_s": 700.0}, state, 30, ALPHA)
+    assert adopt(record, state, step, Fitting()).adopted[0].sensors == ("S2",)
