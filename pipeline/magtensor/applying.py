@@ -308,8 +308,9 @@ def verification(calibrated: Survey, path: Path | Held, planned: Plan) -> dict[s
     """The error blocks of another survey: with the declared model alone, and with all that was adopted.
 
     `total_field_as_read` names errors of the base station that were left in (`_better_as_read`), `contradicted` effects
-    without which |b| would be nearer to the survey's total field, and `left_by_any_calibration_nT` is what of |b| - F
-    no other calibration of the sensors would take off.
+    without which |b| would be nearer to the survey's total field, `extrapolated` those that the survey takes beyond
+    what the calibration has seen, and `left_by_any_calibration_nT` is what of |b| - F no other calibration of the
+    sensors would take off.
     """
     corrected = apply_to(calibrated, path, planned, uniform=True)
     after = survey_block(corrected)
@@ -322,7 +323,7 @@ def verification(calibrated: Survey, path: Path | Held, planned: Plan) -> dict[s
         each = corrected.values("calibrated/b"), corrected.values("total_field"), corrected.good_by_sensor
         found["left_by_any_calibration_nT"] = left_by_any_calibration(*each)
     attributes = corrected["calibrated/b"].attrs
-    told = ("not_taken_off", "total_field_as_read", "contradicted")
+    told = ("not_taken_off", "total_field_as_read", "contradicted", "extrapolated")
     return found | {name: attributes[name] for name in told if name in attributes}
 
 

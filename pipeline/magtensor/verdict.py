@@ -91,7 +91,8 @@ def sentence(outcome: dict[str, Any]) -> str:
         falls, held_out = _falls(before, after), outcome["error"].get("held_out") or {}
         shown_there = bool(held_out.get("after")) and _falls(held_out["before"], held_out["after"])
         absent = not _clearly_worse(before, after) and not _clearly_worse(held_out.get("after"), after, DISAGREES)
-        if not falls and shown_there and absent:
+        beyond = bool((outcome["error"].get("verify") or {}).get("extrapolated"))
+        if not falls and shown_there and (absent or beyond):
             falls = True
             shown = _figures(held_out["before"], held_out["after"])
             told = f"{shown} on held-out blocks{noise}; the errors {where} do not show it: {figures}"
@@ -170,7 +171,8 @@ def _disagreement(outcome: dict[str, Any]) -> str:
         )
     if worse:
         what = f", {contradicted} above all" if contradicted else ""
-        return f"; what was added makes the verification survey worse{what}: it does not carry over"
+        why = f" ({beyond})" if (beyond := verify.get("extrapolated")) else ""
+        return f"; what was added makes the verification survey worse{what}: it does not carry over{why}"
     if contradicted:
         return f"; |b| would be nearer to the verification survey's total field without {contradicted}"
     left = verify.get("left_by_any_calibration_nT")

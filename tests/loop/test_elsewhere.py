@@ -116,6 +116,16 @@ def test_an_effect_beyond_what_the_calibration_has_seen_is_told(
     assert beyond is not None and float(beyond[1]) > 2.0
 
 
+def test_a_verification_survey_in_other_units_does_not_gainsay_the_effect(folder: Path) -> None:
+    def in_mA(file: h5py.File) -> None:
+        file["current_heater"][...] = 1000.0 * file["current_heater"][()]
+
+    other = changed(folder, "hot.h5", in_mA)
+    found = magtensor.close_loop(folder / "heated.h5", search=["current_field"], verify=other).sentence
+    assert found.startswith("The residual was traced to current_field: ") and "on held-out blocks" in found
+    assert re.search(r"does not carry over \(current_field: current_heater goes [\d.e+]+ A beyond what the cal", found)
+
+
 def test_a_channel_that_is_missing_for_a_while_is_told(
     tmp_path: Path, folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -411,7 +411,7 @@ def test_a_session_holds_its_verification_survey(
     written = first.read_text()
     assert yaml.safe_load(written)["verify"] == str(tmp_path / "verify.h5")
     session = Explorer(load_yaml(first), None)
-    assert set(session.verdict()["error"]["verify"]) == {"before", "after"}
+    assert set(session.verdict()["error"]["verify"]) >= {"before", "after"}
     assert session.inputs == [survey, tmp_path / "verify.h5"]
     converse(monkeypatch, capsys, first, "reject offset_drift", options=options)
     assert yaml.safe_load(first.read_text())["verify"] == str(tmp_path / "verify.h5")
