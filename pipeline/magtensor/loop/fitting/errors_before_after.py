@@ -15,7 +15,6 @@ from magtensor.calibration.types import Array
 from magtensor.error_models.terms import Terms
 from magtensor.errors import DataError, NotEnoughData
 from magtensor.loop.evidence.folds import NEARLY_ALL, known_until
-from magtensor.loop.fitting.log_noise import channels_of
 from magtensor.loop.fitting.model import Adopted, Fitting, Record, State
 from magtensor.loop.fitting.refit import joint_state, without
 from magtensor.sharing import shared_out
@@ -43,7 +42,7 @@ def folds_for(state: State) -> NDArray[np.int_]:
         left = _known_without_each(terms, edges)
         if held.max() > NEARLY_ALL:
             first, last = edges[held.argmax()], edges[held.argmax() + 2]
-        elif left.min() < 1.0 - NEARLY_ALL and not channels_of(model, state.excitation):
+        elif left.min() < 1.0 - NEARLY_ALL and not model.channels(state.excitation):
             first, last = edges[left.argmin()], edges[left.argmin() + 1]
         else:
             continue

@@ -16,8 +16,6 @@ from numpy.typing import NDArray
 
 from magtensor.calibration.noise import MAD_TO_SIGMA
 from magtensor.calibration.types import Array
-from magtensor.error_models.excitation import Excitation
-from magtensor.error_models.settings import AnyChannel, profiled
 from magtensor.loop.fitting.model import Adopted, State
 
 
@@ -61,12 +59,6 @@ def _that_does_not_grow(columns: Array, run: NDArray[np.int_]) -> Array:
     return out
 
 
-def channels_of(model: Adopted, x: Excitation) -> set[str]:
-    """The logged channels that a model follows."""
-    marks = profiled(model.component).items()
-    return {mark.pick(x, str(model.settings.get(name, ""))) for name, mark in marks if isinstance(mark, AnyChannel)}
-
-
 def brought_in(state: State, channels: Collection[str] | None = None) -> float:
     """Sum of squares that the noise of the logs of some channels, or of all, puts into the whitened residual through
     what is adopted."""
@@ -77,7 +69,7 @@ def brought_in(state: State, channels: Collection[str] | None = None) -> float:
 
 def would_bring_in(state: State, model: Adopted, theta: Array, channels: Collection[str] | None = None) -> float:
     """The same through one model, adopted or not, with coefficients (P,)."""
-    follows = channels_of(model, state.excitation)
+    follows = model.channels(state.excitation)
     chosen = follows if channels is None else follows & set(channels)
     return sum(_of_a_log(state, model, theta, name) for name in sorted(chosen))
 

@@ -15,7 +15,7 @@ from magtensor.calibration.nominal import Nominal
 from magtensor.calibration.types import Array
 from magtensor.components import Component
 from magtensor.error_models.excitation import Excitation
-from magtensor.error_models.settings import Duration, Range, profiled
+from magtensor.error_models.settings import Duration, Range, followed, profiled
 from magtensor.error_models.station import Station
 from magtensor.error_models.terms import Terms, joined
 from magtensor.errors import UsageError
@@ -105,7 +105,8 @@ class Record:
         return x
 
 
-LAW_OF_TURNING = 5e-4  # of the variance of what follows the turning: its law is known to 2 %, in the second order not
+LAW = 5e-4  # of the variance: the law of what follows the turning is known to 2 %, in the second order not, and what a
+# log of its own shows of a sensor is no better known
 
 
 def regressors(component: Component, x: Excitation, settings: Mapping[str, Any]) -> Terms:
@@ -123,9 +124,14 @@ def regressors(component: Component, x: Excitation, settings: Mapping[str, Any])
         )
     if x.noisier is not None:
         terms = replace(terms, noise=_noise_in(terms, component, x.noisier, settings))
-    if turning(component):
-        terms = replace(terms, noise=np.maximum(terms.noise, LAW_OF_TURNING))
+    if turning(component) or any(of_each_sensor(x, name) for name in followed(component, x, settings)):
+        terms = replace(terms, noise=np.maximum(terms.noise, LAW))
     return terms
+
+
+def of_each_sensor(x: Excitation, channel: str) -> bool:
+    """Whether a log has a value for each of several sensors."""
+    return x.logged[channel].ndim == 2 and len(x.sensors) > 1 and not x.is_vector(channel)
 
 
 def turning(component: Component) -> bool:
@@ -162,6 +168,10 @@ class Adopted:
     @property
     def name(self) -> str:
         return self.component.name
+
+    def channels(self, x: Excitation) -> set[str]:
+        """The logged channels that it follows."""
+        return followed(self.component, x, self.settings)
 
     @property
     def late_s(self) -> float:

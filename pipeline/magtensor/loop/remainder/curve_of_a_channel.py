@@ -19,7 +19,6 @@ from magtensor.error_models.terms import Terms
 from magtensor.loop.evidence.assessment import Colours
 from magtensor.loop.evidence.gains import interleaved_gain
 from magtensor.loop.evidence.grams import Whitened, grams_in
-from magtensor.loop.fitting.log_noise import channels_of
 from magtensor.loop.fitting.model import Adopted, State
 from magtensor.loop.fitting.separation import SEPARATION
 from magtensor.loop.remainder.changing_matrix import BLOCKS, LEAST_SAMPLES
@@ -56,7 +55,7 @@ def another_curve(state: State, model: Adopted, terms: Terms, theta: Array, colo
     """The channel any curve of which explains more than a model does that follows another one, and more than any curve
     of that one; "" where none does. Parameters as above."""
     x = state.excitation
-    own = {name for name in channels_of(model, x) if not x.is_vector(name)}
+    own = {name for name in model.channels(x) if not x.is_vector(name)}
     along = _Along.of(state, terms, theta, colours) if own else None
     if along is None:
         return ""
@@ -113,7 +112,7 @@ def followed(model: Adopted, x: Excitation) -> list[tuple[str, Array]]:
     """The channels with one value, or one for each sensor, that a model follows, each with its course through the
     model's lag."""
     lag, delayed = max(float(model.settings.get("lag_s", 0.0)), 0.0), bool(model.settings.get("delayed", False))
-    names = sorted(name for name in channels_of(model, x) if not x.is_vector(name))
+    names = sorted(name for name in model.channels(x) if not x.is_vector(name))
     return [(name, x.channel(name, lag, delayed)) for name in names]
 
 

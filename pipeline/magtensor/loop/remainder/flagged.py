@@ -11,7 +11,6 @@ from magtensor.error_models.excitation import Excitation
 from magtensor.in_a_row import in_a_row
 from magtensor.loop.evidence.own_noise import OwnNoise
 from magtensor.loop.evidence.residual import residual_of
-from magtensor.loop.fitting.log_noise import channels_of
 from magtensor.loop.fitting.model import Record, State, unread
 from magtensor.loop.fitting.refit import without
 from magtensor.loop.remainder.sparse_readings import SparseReadings
@@ -141,7 +140,7 @@ def _at_an_end(flagged: Mask, state: State, record: Record) -> str:
     """In words, the channel that an adopted effect follows and that is at its largest or smallest in flagged samples:
     there the law of the effect may be another one."""
     kept = ~flagged
-    for channel in sorted({c for model in state.adopted for c in channels_of(model, state.excitation)}):
+    for channel in sorted({c for model in state.adopted for c in model.channels(state.excitation)}):
         values = record.logged[channel].reshape(len(flagged), -1)
         if values.shape[1] != 1 or not kept.any():
             continue

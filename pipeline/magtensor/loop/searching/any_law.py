@@ -24,7 +24,7 @@ from magtensor.loop.evidence.estimate import Estimate
 from magtensor.loop.evidence.golden import golden
 from magtensor.loop.evidence.grams import Whitened
 from magtensor.loop.evidence.scoring import Scorer
-from magtensor.loop.fitting.log_noise import brought_in, channels_of
+from magtensor.loop.fitting.log_noise import brought_in
 from magtensor.loop.fitting.model import Adopted, Fitting, Record, State
 from magtensor.loop.fitting.refit import joint_state
 from magtensor.loop.fitting.separation import fold_gain, separated
@@ -90,7 +90,7 @@ def _in_their_place(
 def _other_powers(state: State, place: int, fixed: int) -> list[int]:
     """The places of other models of that name that follow its channel: powers of it, which a curve stands for."""
     one, x = state.adopted[place], state.excitation
-    if not (follows := channels_of(one, x)):
+    if not (follows := one.channels(x)):
         return []
     added = one.terms(x).adds_to_axes
     return [
@@ -98,7 +98,7 @@ def _other_powers(state: State, place: int, fixed: int) -> list[int]:
         for i, other in enumerate(state.adopted)
         if i >= fixed
         and i != place
-        and (other.name, channels_of(other, x)) == (one.name, follows)
+        and (other.name, other.channels(x)) == (one.name, follows)
         and other.terms(x).adds_to_axes == added
     ]
 
@@ -262,7 +262,7 @@ def _assessed(state: State, model: Adopted, tried: int, alpha: float) -> Candida
     terms = model.terms(state.excitation).at(state.residual.samples)
     now = Whitened.of(state.residual, state.colours.across, state.colours.along, state.terms)
     assessment = assess(now, terms)
-    follows = channels_of(model, state.excitation)
+    follows = model.channels(state.excitation)
     log_noise = brought_in(state, follows)  # flat where a switched channel rests, a curve has less of it
     return Candidate(
         model, tried, terms, assessment, assessment.p * tried, assessment.own_p * tried, assessment.null_p * tried,

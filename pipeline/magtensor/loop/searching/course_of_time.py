@@ -23,7 +23,6 @@ from magtensor.error_models.settings import Beginning, Choice, Orders, Range, pr
 from magtensor.error_models.terms import Terms, joined
 from magtensor.loop.evidence.assessment import WHITE, colours_of, estimated, explained
 from magtensor.loop.evidence.residual import Residual, taken_off
-from magtensor.loop.fitting.log_noise import channels_of
 from magtensor.loop.fitting.model import Adopted, State, generic
 from magtensor.loop.searching.beginnings import beginning, one_pattern
 from magtensor.loop.searching.contribution import happens_once, put_back_one
@@ -150,7 +149,7 @@ def rivals_in_time(candidate: Candidate, possible: Sequence[Candidate], state: S
 
 def _followed(model: Adopted, x: Excitation) -> str:
     """What a response follows: its one channel, or the field if it lags that; "" for neither, and for several."""
-    channels = channels_of(model, x)
+    channels = model.channels(x)
     if not channels:
         return "" if beginning(model.component, model.settings) is None else THE_FIELD
     (name, *others) = channels

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from magtensor.error_models.excitation import Excitation
 from magtensor.error_models.settings import Range, profiled
 from magtensor.errors import DataError
-from magtensor.loop.fitting.log_noise import channels_of
 from magtensor.loop.fitting.model import Adopted, Fitting, Record, State
 from magtensor.loop.fitting.separation import SEPARATION, fold_gain
 from magtensor.loop.fitting.trial import Trial, on_the_folds_of, trial
@@ -104,10 +103,10 @@ def why_not(record: Record, before: Trial, after: Trial, chosen: Candidate, how:
     model = after.state.adopted[which]
     acts_on = model.sensors or x.sensors
     same = [a for a in after.state.adopted[:which] if set(a.sensors or x.sensors) & set(acts_on)]
-    two_channels = chosen.moved is None and channels_of(model, x)
+    two_channels = chosen.moved is None and model.channels(x)
     if not two_channels and already(same, model.component, model.settings):
         return ONE_OF_A_KIND
-    slow, channels = hardly_begun(chosen.model, x), sorted(channels_of(model, x))
+    slow, channels = hardly_begun(chosen.model, x), sorted(model.channels(x))
     if (slow or channels) and of_all_alike(after.state, which):
         drift = "drifts" if slow else f"follows {' and '.join(channels)}"
         return f"fitted, all sensors show it alike: an error of the base station that {drift} would look the same"

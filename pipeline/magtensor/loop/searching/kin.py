@@ -17,7 +17,6 @@ from magtensor.error_models.needs import FACTS
 from magtensor.error_models.settings import Duration, EventTimes, Range, profiled
 from magtensor.error_models.terms import Terms
 from magtensor.loop.evidence.assessment import NEARLY_ALL, Assessment
-from magtensor.loop.fitting.log_noise import channels_of
 from magtensor.loop.fitting.model import Adopted, State, generic
 from magtensor.loop.searching.contribution import a_tone, moments
 from magtensor.loop.searching.gates import Candidate, explained_by, seen_between
@@ -71,7 +70,7 @@ def _explained(state: State, by: set[str], model: Adopted, terms: Terms, assessm
 
 def drivers(model: Adopted, x: Excitation) -> set[str]:
     """The channels that a model follows, and `TIME` of what drifts, warms up or happens once."""
-    found = channels_of(model, x) | {need for need in model.component.declared({}).needs if need in x.logged}
+    found = model.channels(x) | {need for need in model.component.declared({}).needs if need in x.logged}
     return found | ({TIME} if any(map(_of_time, profiled(model.component).values())) else set())
 
 

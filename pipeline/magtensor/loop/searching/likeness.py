@@ -12,7 +12,6 @@ from magtensor.error_models.curves import along_a_curve, bends_of
 from magtensor.error_models.terms import Terms
 from magtensor.error_models.waveform import NAME, free_directions
 from magtensor.loop.evidence.folds import FOLDS
-from magtensor.loop.fitting.log_noise import channels_of
 from magtensor.loop.fitting.model import Record, State
 from magtensor.loop.remainder.curve_of_a_channel import PIECES
 from magtensor.loop.searching.contribution import happens_once
@@ -128,7 +127,7 @@ def event_along(state: State, terms: Terms, theta: Array) -> str:
     if each.max() >= ONE_SENSOR * each.sum():  # or what is of the reference, and moves none
         return ""
     direction = np.linalg.svd((moved - moved.mean(axis=0)) @ basis, full_matrices=False)[2][0]
-    following = [i for i, a in enumerate(state.adopted) if channels_of(a, state.excitation) or a.name == NAME]
+    following = [i for i, a in enumerate(state.adopted) if a.channels(state.excitation) or a.name == NAME]
     some = replace(state, adopted=tuple(state.adopted[i] for i in following))
     return effect_along(replace(some, theta=tuple(state.theta[i] for i in following)), basis, direction)
 

@@ -23,7 +23,6 @@ from magtensor.error_models.terms import joined
 from magtensor.error_models.waveform import NAME
 from magtensor.loop.evidence.assessment import estimated
 from magtensor.loop.evidence.residual import taken_off
-from magtensor.loop.fitting.log_noise import channels_of
 from magtensor.loop.fitting.model import Adopted, State
 from magtensor.loop.remainder.predictable import (
     MOST_OF_IT,
@@ -99,7 +98,7 @@ def _follows_a_vector(state: State, places: Sequence[int]) -> bool:
     """Whether adopted models follow a logged vector, through whatever lag: each component with coefficients of its own,
     they imitate most of what the attitude does."""
     x = state.excitation
-    return any(x.is_vector(name) for place in places for name in channels_of(state.adopted[place], x))
+    return any(x.is_vector(name) for place in places for name in state.adopted[place].channels(x))
 
 
 def _of_what_wanders(found: Search, state: State, places: Sequence[int]) -> str:

@@ -16,7 +16,7 @@ from magtensor.loop.evidence.assessment import WHITE, Assessment, assess
 from magtensor.loop.evidence.grams import Whitened
 from magtensor.loop.evidence.own_noise import OwnNoise
 from magtensor.loop.evidence.scoring import Scorer
-from magtensor.loop.fitting.log_noise import brought_in, channels_of
+from magtensor.loop.fitting.log_noise import brought_in
 from magtensor.loop.fitting.model import Adopted, State, generic
 from magtensor.loop.fitting.separation import Assessed, lowest, plainer
 from magtensor.loop.searching.contribution import happens_once
@@ -179,5 +179,5 @@ def _one_each(state: State, assessed: Sequence[Assessed]) -> list[Assessed]:
 
 
 def _log_noise(state: State, model: Adopted, terms: Terms, assessment: Assessment) -> float:
-    same = brought_in(state, channels_of(model, state.excitation)) if generic(model) else 0.0
+    same = brought_in(state, model.channels(state.excitation)) if generic(model) else 0.0
     return max(same, of_another_log(state, model, terms, assessment.estimate))

@@ -14,7 +14,7 @@ import numpy as np
 from magtensor.calibration.types import Array
 from magtensor.error_models.terms import Terms
 from magtensor.loop.evidence.estimate import Estimate
-from magtensor.loop.fitting.log_noise import brought_in, channels_of, would_bring_in
+from magtensor.loop.fitting.log_noise import brought_in, would_bring_in
 from magtensor.loop.fitting.model import Adopted, State
 from magtensor.loop.searching.contribution import slices
 from magtensor.loop.searching.gates import Candidate, gained_of_a_log
@@ -35,19 +35,19 @@ def of_another_log(state: State, model: Adopted, terms: Terms, estimate: Estimat
     estimate: of the adopted terms and then the model's.
     """
     x = state.excitation
-    if state.terms is None or not channels_of(model, x):
+    if state.terms is None or not model.channels(x):
         return 0.0
     vectors = {
         which: _vectors(state.terms.only(range(part.start, part.stop)), state.theta[which], terms)
         for which, part in enumerate(slices(state))
-        if channels_of(state.adopted[which], x)
+        if state.adopted[which].channels(x)
     }
     alike = [which for which, several in vectors.items() if several]
     first = state.terms.count
     patterns = np.array([vector for which in alike for vector in vectors[which]]).T
     if not alike or not _along(estimate.theta[first:], estimate.beside(first), patterns):
         return 0.0
-    return brought_in(state, set().union(*(channels_of(state.adopted[which], x) for which in alike)))
+    return brought_in(state, set().union(*(state.adopted[which].channels(x) for which in alike)))
 
 
 def worse_log(best: Candidate, other: Candidate, behind: float, state: State) -> bool:
@@ -58,7 +58,7 @@ def worse_log(best: Candidate, other: Candidate, behind: float, state: State) ->
     behind: twice the log likelihood ratio on held-out folds.
     """
     x = state.excitation
-    if not (channels_of(best.model, x) and channels_of(other.model, x)):
+    if not (best.model.channels(x) and other.model.channels(x)):
         return False
     first = len(best.assessment.estimate.theta) - best.terms.count
     own, its = best.assessment.estimate.theta[first:], other.assessment.estimate.theta[first:]

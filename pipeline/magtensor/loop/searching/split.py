@@ -19,7 +19,7 @@ from magtensor.loop.evidence.assessment import WHITE, assess, colours_of, estima
 from magtensor.loop.evidence.golden import golden
 from magtensor.loop.evidence.grams import Whitened
 from magtensor.loop.evidence.scoring import Scorer
-from magtensor.loop.fitting.log_noise import brought_in, channels_of
+from magtensor.loop.fitting.log_noise import brought_in
 from magtensor.loop.fitting.model import Adopted, State
 from magtensor.loop.searching.beginnings import beginning
 from magtensor.loop.searching.contribution import put_back_one
@@ -121,7 +121,7 @@ def _assessed(state: State, place: int, name: str, pair: tuple[float, float], al
     both = joined([m.terms(state.excitation).at(state.residual.samples) for m in (one, other)])
     now = Whitened.of(state.residual, state.colours.across, state.colours.along, state.terms)
     assessment = assess(now, both)
-    log_noise = brought_in(state, channels_of(model, state.excitation))
+    log_noise = brought_in(state, model.channels(state.excitation))
     return Candidate(
         other, tried, both, assessment, assessment.p * tried, assessment.own_p * tried, assessment.null_p * tried,
         alpha, log_noise, explained_beside(state, other, both, assessment), moved=(place, one),
