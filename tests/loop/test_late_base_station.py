@@ -133,3 +133,21 @@ def test_what_was_found_of_it_is_no_failure_of_the_calibration(tmp_path: Path) -
     survey = run(planned, empty_survey(planned)).survey
     states = dict(zip(survey.values("qc/metric").tolist(), survey.values("qc/state").tolist(), strict=True))
     assert [states[f"total_field_rms S{i}"] for i in range(1, 5)] == ["pass"] * 4
+
+
+def test_a_jump_of_the_station_on_a_quiet_day_is_no_wrong_scale_of_it(tmp_path: Path) -> None:
+    """Nearly all that the recorded field does is the jump, which a scale factor of the variation repeats: that explains
+    much more than a few per cent of a scale could, and is refused; so the jump is none of it."""
+
+    def moved(path: Path) -> None:
+        with h5py.File(path, "a") as file:
+            field, time = file["reference/total_field"], file["reference/time"][()]
+            field[:] = field[:] + 40.0 * (time >= file["time"][0] + 500.0)
+
+    quiet = scenario(46)
+    quiet["field"]["variation"] = {"irregular": {"rms_nT": 1.0, "time_s": 300.0}}
+    told = verdict_of(tmp_path, quiet, moved, ["reference_step", "reference_scale", "reference_drift"])
+    (jump,) = told["adopted"]
+    assert jump["error_model"] == "reference_step", told["unexplained"]["description"]
+    assert jump["coefficients"][0]["value"] == pytest.approx(40.0, abs=0.5)
+    assert not told["unexplained"]["present"], told["unexplained"]["description"]

@@ -11,11 +11,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from magtensor.loop.fitting.model import State, generic
+from magtensor.loop.fitting.model import Fitting, Record, State, generic
 from magtensor.loop.fitting.separation import fold_gain, separated
-from magtensor.loop.searching.contribution import put_back_one, slices
+from magtensor.loop.fitting.trial import Trial, per_sample, trial
+from magtensor.loop.searching.contribution import put_back_one, slices, without_models
+from magtensor.loop.searching.course_of_time import beside_time
 from magtensor.loop.searching.found import Step
 from magtensor.loop.searching.gates import Candidate
+from magtensor.loop.searching.keeping import fitted
 from magtensor.loop.searching.rivals import hardly_begun
 from magtensor.loop.searching.screening import candidates_of
 
@@ -71,6 +74,27 @@ def exchange(state: State, steps: Sequence[Step], fixed: int) -> Exchange | None
             if other.terms.count < size and not separated(mine, theirs):
                 return Exchange(place, other, False)
     return None
+
+
+def exchanged(
+    record: Record, state: State, steps: Sequence[Step], how: Fitting, fixed: int, models: int
+) -> tuple[Trial, Step] | None:
+    """The fit with another model in the place of an adopted one that it does as well as, or better, and the round's
+    story."""
+    found = exchange(state, steps, fixed)
+    if found is None:
+        return None
+    old = state.adopted[found.place].name
+    without = without_models(record, state, [found.place], how)
+    chosen = looked_at_again(without, found.other, models)
+    if chosen is None or (found.better and beside_time(chosen, without).refused):
+        return None
+    before = trial(record, without, how)
+    tried = fitted(record, before, chosen, how)
+    if tried.after is None or tried.why or (found.better and per_sample(tried.after.state) <= per_sample(state)):
+        return None
+    rivals = () if found.better else (old,)
+    return tried.after, Step(without, (chosen,), chosen, rivals, refused={old: found.why})
 
 
 def looked_at_again(state: State, other: Candidate, models: int) -> Candidate | None:

@@ -17,10 +17,18 @@ from magtensor.loop.remainder.tones import channels_of_the_line, tones
 from magtensor.loop.searching.any_law import by_a_curve, by_any_law, by_any_law_of
 from magtensor.loop.searching.contribution import eliminate, tones_of, without_models
 from magtensor.loop.searching.course_of_time import beside_time, rivals_in_time
-from magtensor.loop.searching.exchange import exchange, looked_at_again
+from magtensor.loop.searching.exchange import exchanged, looked_at_again
 from magtensor.loop.searching.found import Step
 from magtensor.loop.searching.gates import Candidate
-from magtensor.loop.searching.keeping import ONE_OF_A_KIND, UNEARNED, Fitted, fitted, fitted_everywhere, why_not
+from magtensor.loop.searching.keeping import (
+    NOT_AS_ASSUMED,
+    ONE_OF_A_KIND,
+    UNEARNED,
+    Fitted,
+    fitted,
+    fitted_everywhere,
+    why_not,
+)
 from magtensor.loop.searching.larger_law import part_of_a_gradient, part_of_a_larger_law
 from magtensor.loop.searching.latent import NAME, Sought, Source, renewed, sought, tried_source
 from magtensor.loop.searching.likeness import followed_by_a_curve, part_of_the_source
@@ -44,6 +52,7 @@ from magtensor.loop.searching.which_channel import nearest
 
 MOST_OF_A_SAMPLE = 50.0  # log likelihood: half of the largest squared residual of a sample that noise may explain
 ROUNDING = 1e-4  # mean square of the whitened residual: far below the least noise that any sensor is believed to have
+AS_LASTING = "{}, which lasts, predicts as much"
 
 
 @dataclass(frozen=True)
@@ -136,10 +145,10 @@ class Rounds:
                     )
                     state, steps = standing.state, [*steps, *more]
                 continue
-            exchanged = None if asked else _exchanged(record, state, steps, how, self.fixed, open_)
+            instead = None if asked else exchanged(record, state, steps, how, self.fixed, open_)
             asked = True
-            if exchanged is not None:
-                after, step = exchanged
+            if instead is not None:
+                after, step = instead
                 if self.say is not None and step.adopted is not None:
                     self.say(f"{step.adopted.model.name} takes the place of {', '.join(step.refused)}")
                 steps[-1] = step
@@ -202,7 +211,8 @@ class Rounds:
             possible = [c for c in left if c.predicts]
             best = containing(best, possible, before.state)
             chosen, rivals = simplest(best, possible, before.state)
-            if why := self.of_another(chosen, candidates, before.state):
+            lawful = [c for c in candidates if refused.get(c.model.name) != NOT_AS_ASSUMED]
+            if why := self.of_another(chosen, lawful, before.state):
                 refuse(chosen.model.name, why)
                 continue
             chosen, channels = nearest(chosen, before.state, models, anything)
@@ -233,6 +243,10 @@ class Rounds:
                     return replace(two, rivals=rivals, channels=channels, refused=refused)
             if tried.after is None or tried.why:
                 refuse(chosen.model.name, tried.why)
+                for c in candidates if tried.why == NOT_AS_ASSUMED else ():
+                    if refused.get(c.model.name) == AS_LASTING.format(chosen.model.name):
+                        del refused[c.model.name]
+                        left.append(c)
                 for c in list(left) if tried.why != UNEARNED else ():
                     if not c.passes:
                         continue
@@ -258,7 +272,7 @@ class Rounds:
     def of_another(self, chosen: Candidate, candidates: Sequence[Candidate], state: State) -> str:
         """Why a candidate, before it is fitted, is taken for a part of what another model explains; "" if it is not."""
         if name := part_of_a_drift(chosen, candidates, state):
-            return f"{name}, which lasts, predicts as much"
+            return AS_LASTING.format(name)
         if name := rate_instead(chosen, state, self.models):
             return f"{name}, for which the field turns too fast between samples, explains more"
         return part_of_a_larger_law(chosen, state) or part_of_a_gradient(chosen, state)
@@ -351,27 +365,6 @@ def _outdone(chosen: Candidate, state: State) -> str:
     theta = chosen.assessment.theta[-chosen.terms.count :]
     seen = chosen.before or state  # at the samples of its terms
     return another_curve(seen, chosen.model, chosen.terms, theta, chosen.assessment.colours)
-
-
-def _exchanged(
-    record: Record, state: State, steps: Sequence[Step], how: Fitting, fixed: int, models: int
-) -> tuple[Trial, Step] | None:
-    """The fit with another model in the place of an adopted one that it does as well as, or better, and the round's
-    story."""
-    found = exchange(state, steps, fixed)
-    if found is None:
-        return None
-    old = state.adopted[found.place].name
-    without = without_models(record, state, [found.place], how)
-    chosen = looked_at_again(without, found.other, models)
-    if chosen is None or (found.better and beside_time(chosen, without).refused):
-        return None
-    before = trial(record, without, how)
-    tried = fitted(record, before, chosen, how)
-    if tried.after is None or tried.why or (found.better and per_sample(tried.after.state) <= per_sample(state)):
-        return None
-    rivals = () if found.better else (old,)
-    return tried.after, Step(without, (chosen,), chosen, rivals, refused={old: found.why})
 
 
 def _source_instead(
