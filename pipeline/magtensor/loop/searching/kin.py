@@ -22,6 +22,7 @@ from magtensor.loop.searching.contribution import a_tone, moments
 from magtensor.loop.searching.gates import Candidate, explained_by, seen_between
 
 MOST = 0.5  # of what a candidate explains
+NEXT = 2  # samples: that a jump takes, or that it seems to be away while another part of it has no name
 TIME = " time"  # no channel has that name
 
 
@@ -75,10 +76,10 @@ def drivers(model: Adopted, x: Excitation) -> set[str]:
 
 
 def _same_moment(model: Adopted, other: Adopted, x: Excitation) -> bool:
-    """Whether two events happened between the same samples: a jump of C is one of its scale factors and one of its
-    angles, and what one leaves there the other explains exactly."""
+    """Whether two events happened between the same samples, or the next ones: a jump of C is one of its scale factors
+    and one of its angles, and what one leaves there the other explains exactly."""
     mine, theirs = (np.searchsorted(x.elapsed, moments(m)) for m in (model, other))
-    return mine.size > 0 and mine.shape == theirs.shape and bool(np.all(mine == theirs))
+    return mine.size > 0 and mine.shape == theirs.shape and bool(np.all(np.abs(mine - theirs) <= NEXT))
 
 
 def _of_the_field_alone(model: Adopted, x: Excitation) -> bool:

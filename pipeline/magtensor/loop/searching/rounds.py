@@ -32,6 +32,7 @@ from magtensor.loop.searching.keeping import (
 from magtensor.loop.searching.larger_law import part_of_a_gradient, part_of_a_larger_law
 from magtensor.loop.searching.latent import NAME, Sought, Source, renewed, sought, tried_source
 from magtensor.loop.searching.likeness import followed_by_a_curve, part_of_the_source
+from magtensor.loop.searching.on_fewer_sensors import on_those_needed
 from magtensor.loop.searching.on_more_sensors import in_the_place_of_others, on_more_sensors
 from magtensor.loop.searching.own_fit import at_their_own_fit
 from magtensor.loop.searching.profiling import repeatable
@@ -267,7 +268,11 @@ class Rounds:
         last, dropped = eliminate(record, tried.after.state, how, self.fixed)
         if chosen.model.name in dropped and len(last.adopted) <= len(before.state.adopted):
             return replace(tried, why=UNEARNED), ()
-        return (replace(tried, after=trial(record, last, how)) if dropped else tried), dropped
+        if not dropped:
+            return tried, ()
+        if last.adopted[-1].name == chosen.model.name:  # beside what is gone it may have seemed to be on more
+            last = on_those_needed(record, last, len(last.adopted) - 1, how)
+        return replace(tried, after=trial(record, last, how)), dropped
 
     def of_another(self, chosen: Candidate, candidates: Sequence[Candidate], state: State) -> str:
         """Why a candidate, before it is fitted, is taken for a part of what another model explains; "" if it is not."""
