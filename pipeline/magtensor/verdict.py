@@ -175,18 +175,23 @@ def _disagreement(outcome: dict[str, Any]) -> str:
         return f"; what was added makes the verification survey worse{what}: it does not carry over{why}"
     if contradicted:
         return f"; |b| would be nearer to the verification survey's total field without {contradicted}"
-    left = verify.get("left_by_any_calibration_nT")
-    if apart and left is not None and left > DISAGREES * here["all"]:
-        return (
-            f"; the verification survey has {figure(left)} nT rms of |b| - F that no calibration would take off: noise "
-            "or disturbances of its own"
+    if not apart:
+        return ""
+    each = {s: v for s, v in after.items() if s != "all" and v is not None and here.get(s)}
+    sensors = [s for s, v in each.items() if v > DISAGREES * here[s]]
+    where = f" of {', '.join(sensors)}" if 0 < len(sensors) < len(each) else ""
+    words, left = "", verify.get("left_by_any_calibration_nT") or 0.0
+    if after["all"] > DISAGREES * left:
+        words = (
+            f"; the verification survey disagrees with the calibration{where}: something changed between the two, or "
+            "the first shows too little of what the second needs"
         )
-    if apart:
-        return (
-            "; the verification survey disagrees with the calibration: something changed between the two, or the first "
-            "shows too little of what the second needs"
+    if left > DISAGREES * here["all"]:
+        words += (
+            f"; the verification survey has {figure(left)} nT rms of |b| - F{where} that no calibration would take "
+            "off: noise or disturbances of its own"
         )
-    return ""
+    return words
 
 
 def _judged(outcome: dict[str, Any]) -> tuple[str, dict[str, Any] | None, dict[str, Any] | None]:

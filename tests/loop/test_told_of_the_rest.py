@@ -215,3 +215,35 @@ def test_what_was_adopted_more_than_once_is_counted_and_a_channel_named() -> Non
     assert "traced to 2 x offset_step, channel_response of throttle:" in sentence(outcome)
     adopted[2] |= {"error_model": "temperature_offset", "channels_as_good": ["intake", "room"]}
     assert "2 x offset_step, temperature_offset of throttle (or of intake or room):" in sentence(outcome)
+
+
+@pytest.mark.parametrize(
+    ("left", "each", "changed", "own"),
+    [
+        (0.16, {"S1": 0.2, "S2": 500.0}, "disagrees with the calibration of S2: something changed", ""),
+        (3.0, {"S1": 0.2, "S2": 500.0}, "disagrees with the calibration of S2: ", "3 nT rms of |b| - F of S2 that no"),
+        (300.0, {"S1": 500.0, "S2": 500.0}, "", "300 nT rms of |b| - F that no calibration would take off"),
+        (0.16, {"S1": 0.2, "S2": 0.2}, "", ""),
+    ],
+)
+def test_where_another_survey_disagrees_is_told(left: float, each: dict[str, float], changed: str, own: str) -> None:
+    """A sensor put where another had been: noise of its own is the least of what that survey shows."""
+
+    def block(each: dict[str, float]) -> dict[str, Any]:
+        rms = float(np.sqrt(np.mean(np.square([*each.values()]))))
+        return {"total_field_rms_nT": {**each, "all": rms}, "tensor_rms_nT_per_m": None}
+
+    here, there = block({"S1": 0.16, "S2": 0.16}), block(each)
+    said = sentence({
+        "declared": ["linear"],
+        "adopted": [],
+        "noise_floor_nT": 0.15,
+        "unexplained": {"present": False, "description": "nothing", "excess_rms_nT": 0.0, "looks_like": []},
+        "error": {
+            "fit": here,
+            "held_out": {"before": here, "after": here},
+            "verify": {"before": there, "after": there, "left_by_any_calibration_nT": left},
+        },
+    })  # fmt: skip
+    assert changed in said and own in said
+    assert ("disagrees" in said) is bool(changed) and ("no calibration" in said) is bool(own)
