@@ -10,7 +10,7 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
-from loop_cases import BASE, adopted_names, loaded, scenario, verdict_of
+from loop_cases import BASE, adopted_names, loaded, scenario, synthetic, verdict_of
 from scipy.signal import lfilter
 
 from magtensor.loop.fitting.model import Adopted, Fitting
@@ -78,6 +78,23 @@ def test_what_happens_once_overshadows_nothing(tmp_path: Path) -> None:
     told = verdict_of(tmp_path, scenario(25, *effects, motion=SHORT), models=(*MODELS, "passing_source"))
     assert "nonlinearity_quadratic" in adopted_names(told)
     assert adopted_names(told) <= {"nonlinearity_quadratic", "passing_source"}
+
+
+@pytest.mark.parametrize(("after", "taken"), [(0.126, True), (0.1182, False), (0.08, False)])
+def test_what_held_out_blocks_are_predicted_worse_with_is_taken_out(
+    after: float, taken: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    record = synthetic(5, 400)
+    step = Adopted(Registry.load().find("error_model", "offset_step"), {"time_s": 200.0})
+    state = joint_state(record, [step], Fitting())
+    found: Any = SimpleNamespace(told=state, last=state, steps=(), record=record, shared=None)
+    monkeypatch.setattr(overshadowed, "staying", lambda _: 0.0)
+    monkeypatch.setattr(overshadowed, "without_and_with", lambda *_: (0.118, after))
+    monkeypatch.setattr(overshadowed, "_part_of_a_source", lambda *_: None)
+    why = overshadowed.overshadowed(found, 0)
+    assert (
+        why is not None and why[0] == [0] and "better without it (0.118 nT rms) than with (0.126)" in why[1]
+    ) is taken
 
 
 def test_how_much_of_an_effect_follows_the_attitude(tmp_path: Path) -> None:

@@ -7,7 +7,9 @@ quadratic nonlinearity. So an adopted effect that follows the attitude and expla
 taken out again. So is a tone that may be a harmonic of how the platform turns; and so is what happened once, where more
 of the kind beside it is significant and predicts nothing, as where a sensor wanders, or where the sensors share a
 waveform that has no name and is larger, or switches along the same vectors: a step or a passage may be a part of it;
-and a source that nobody logged, whose waveform may be a small part of any law that has no name.
+and a source that nobody logged, whose waveform may be a small part of any law that has no name. And whatever is larger,
+an effect with which held-out blocks are predicted worse than without it, once no noise is weighed against another, was
+one of a few samples that the colour of the noise made much of.
 """
 
 from __future__ import annotations
@@ -35,6 +37,7 @@ from magtensor.loop.searching.found import Search, without_and_with
 from magtensor.loop.searching.suspects import unlikely
 from magtensor.loop.searching.unexplained import unexplained
 
+WORSE = 1.01  # times the held-out rms without an effect, all noise alike: noise of a colour does not make up for that
 NAMELESS = 2.0  # times what stays, that a response to a logged vector explains if it is the law
 ALONG = 0.95  # cosine, with a source's vector or another event's; of one sensor 5 % of all directions are as near
 HARMONICS = 16  # of the turning, that a law of the attitude with a corner shows
@@ -49,6 +52,11 @@ def overshadowed(found: Search, fixed: int) -> tuple[list[int], str] | None:
         return part
     for places in _of_one_name(state, fixed):
         before, after = without_and_with(found, *places)
+        if after > WORSE * before:
+            return (
+                places,
+                f"held-out blocks are predicted better without it ({before:.3g} nT rms) than with ({after:.3g})",
+            )
         amount = float(np.sqrt(max(before**2 - after**2, 0.0)))
         if amount >= left * (NAMELESS if _follows_a_vector(state, places) else 1.0) or (
             weakest is not None and amount >= weakest[0]
