@@ -12,8 +12,9 @@ from loop_cases import BASE, Array, adopted_names, linear_state, scenario, synth
 from scipy.spatial.transform import Rotation
 from test_changing_matrix import turned
 
-from magtensor.loop.fitting.model import Fitting
-from magtensor.loop.searching import by_hand
+from magtensor.loop.fitting.model import Adopted, Fitting
+from magtensor.loop.fitting.refit import joint_state
+from magtensor.loop.searching import by_hand, kin
 from magtensor.loop.searching.adopting import adopt
 from magtensor.loop.searching.gates import ALPHA
 from magtensor.registry import Registry
@@ -70,3 +71,15 @@ def test_a_large_turn_is_of_the_sensor_that_turned_as_a_small_one_is(arcmin: flo
     state = linear_state(record)
     step = by_hand.candidate(Registry.load().find("error_model", model), {"time_s": 700.0}, state, 30, ALPHA)
     assert adopt(record, state, step, Fitting()).adopted[0].sensors == ("S2",)
+
+
+@pytest.mark.parametrize(("model", "holds"), [("calibration_step", True), ("scale_step", False)])
+def test_what_holds_an_event_and_more_is_no_next_order_of_it(model: str, holds: bool) -> None:
+    """Beside a turn by two degrees, of which the square is left, the best moment for the rest may be a sample off."""
+    record = turned(synthetic(3), 1, np.where(np.arange(1200) >= 700, 120.0 * ARCMIN, 0.0))
+    registry = Registry.load()
+    turn = Adopted(registry.find("error_model", "turn_step"), {"time_s": 700.0}, ("S2",))
+    state = joint_state(record, [turn], Fitting())
+    rest = by_hand.candidate(registry.find("error_model", model), {"time_s": 701.0}, state, 30, ALPHA)
+    assert kin._holds(rest.terms, state, 0) is holds
+    assert not (holds and rest.of_the_law)

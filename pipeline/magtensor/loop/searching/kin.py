@@ -22,7 +22,8 @@ from magtensor.loop.searching.contribution import a_tone, moments
 from magtensor.loop.searching.gates import Candidate, explained_by, seen_between
 
 MOST = 0.5  # of what a candidate explains
-NEXT = 2  # samples: that a jump takes, or that it seems to be away while another part of it has no name
+NEXT = 2  # samples: that a jump seems to be away while another part of it has no name
+MISSED = 0.01  # of the squares of an event that is held by another: some samples between the two
 TIME = " time"  # no channel has that name
 
 
@@ -61,7 +62,8 @@ def _explained(state: State, by: set[str], model: Adopted, terms: Terms, assessm
         place
         for place, other in enumerate(state.adopted)
         if other.name != model.name
-        and not _same_moment(model, other, state.excitation)
+        and not _of_one_moment(model, other, state.excitation)
+        and not (_of_one_moment(model, other, state.excitation, NEXT) and _holds(terms, state, place))
         and not (between and other.component.effect == "reference")
         and by & drivers(other, state.excitation)
         and _held_by(other.sensors or state.excitation.sensors, state, terms, assessment) > NEARLY_ALL
@@ -75,11 +77,30 @@ def drivers(model: Adopted, x: Excitation) -> set[str]:
     return found | ({TIME} if any(map(_of_time, profiled(model.component).values())) else set())
 
 
-def _same_moment(model: Adopted, other: Adopted, x: Excitation) -> bool:
-    """Whether two events happened between the same samples, or the next ones: a jump of C is one of its scale factors
+def _of_one_moment(model: Adopted, other: Adopted, x: Excitation, apart: int = 0) -> bool:
+    """Whether two events happened between the same samples, or so many away: a jump of C is one of its scale factors
     and one of its angles, and what one leaves there the other explains exactly."""
     mine, theirs = (np.searchsorted(x.elapsed, moments(m)) for m in (model, other))
-    return mine.size > 0 and mine.shape == theirs.shape and bool(np.all(np.abs(mine - theirs) <= NEXT))
+    return mine.size > 0 and mine.shape == theirs.shape and bool(np.all(np.abs(mine - theirs) <= apart))
+
+
+def _holds(terms: Terms, state: State, place: int) -> bool:
+    """Whether a candidate's terms would explain nearly all that an adopted effect explains: it is that effect with more
+    freedom, and no next order of it."""
+    outputs = len(state.residual.noise)
+    effect = state.adopted[place].terms(state.excitation).at(state.residual.samples)
+    added = effect.contribution(state.theta[place], outputs).reshape(-1, outputs // 3, 3)
+    left = 0.0
+    for number, sensor in enumerate(state.excitation.sensors):
+        own, here = [k for k, s in enumerate(terms.sensors) if s == sensor], added[:, number].ravel()
+        if not own or not here.any():
+            left += float(here @ here)
+            continue
+        units = (terms.only([k]).contribution(np.ones(1), outputs) for k in own)
+        each = np.column_stack([unit[:, 3 * number : 3 * number + 3].ravel() for unit in units])
+        missed = here - each @ np.linalg.lstsq(each, here, rcond=None)[0]
+        left += float(missed @ missed)
+    return left < MISSED * float(np.sum(added**2))
 
 
 def _of_the_field_alone(model: Adopted, x: Excitation) -> bool:
