@@ -65,7 +65,8 @@ every recipe.
   explained)` says whether fitted coefficients are what the settings assume, where both mean one thing, and explain as
   large a share of |b| - F as such coefficients must; the loop adopts nothing of which they are not.
   `about=function(settings, coefficients)` gives the settings about which a model that is linear only nearby is to be
-  made for such coefficients.
+  made for such coefficients. `means=function(x, settings, coefficients)` says in a few words what coefficients, by
+  sensor and name, mean together: the verdict holds it as `means` beside them, and its sentence in brackets.
 
 `check_error_model(my_model)` of `magtensor.loop.checker` gives a list of everything that is wrong with it; put
 `assert check_error_model(my_model) == []` into your tests.
