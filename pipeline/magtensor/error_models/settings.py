@@ -308,16 +308,6 @@ class Frequencies:
         return [float(f) for f in x.lines[: self.count]]
 
 
-def followed(model: Component, x: Excitation, settings: Mapping[str, Any]) -> set[str]:
-    """The channels that a model follows with such settings.
-
-    Raises:
-        DataError: no channel of that name, or not exactly one fits where none is named.
-    """
-    marks = profiled(model).items()
-    return {mark.pick(x, str(settings.get(name, ""))) for name, mark in marks if isinstance(mark, AnyChannel)}
-
-
 def profiled(model: Component) -> dict[str, Any]:
     """The settings of a model that are searched over, with their grids."""
     found = {}

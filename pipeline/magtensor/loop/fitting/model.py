@@ -15,7 +15,7 @@ from magtensor.calibration.nominal import Nominal
 from magtensor.calibration.types import Array
 from magtensor.components import Component
 from magtensor.error_models.excitation import Excitation
-from magtensor.error_models.settings import Duration, Range, followed, profiled
+from magtensor.error_models.settings import AnyChannel, Duration, Range, profiled
 from magtensor.error_models.station import Station
 from magtensor.error_models.terms import Terms, joined
 from magtensor.errors import UsageError
@@ -124,14 +124,17 @@ def regressors(component: Component, x: Excitation, settings: Mapping[str, Any])
         )
     if x.noisier is not None:
         terms = replace(terms, noise=_noise_in(terms, component, x.noisier, settings))
-    if turning(component) or any(of_each_sensor(x, name) for name in followed(component, x, settings)):
+    if turning(component) or _follows_logs_of_each(component, x, settings):
         terms = replace(terms, noise=np.maximum(terms.noise, LAW))
     return terms
 
 
-def of_each_sensor(x: Excitation, channel: str) -> bool:
-    """Whether a log has a value for each of several sensors."""
-    return x.logged[channel].ndim == 2 and len(x.sensors) > 1 and not x.is_vector(channel)
+def _follows_logs_of_each(component: Component, x: Excitation, settings: Mapping[str, Any]) -> bool:
+    """Whether a model follows a log that has a value for each of several sensors."""
+    marks = {name: mark for name, mark in profiled(component).items() if isinstance(mark, AnyChannel)}
+    names = {str(settings.get(name, "")) or next(iter(mark.values(x)), "") for name, mark in marks.items()}
+    logs = [name for name in names if name in x.logged and not x.is_vector(name)]
+    return len(x.sensors) > 1 and any(x.logged[name].ndim == 2 for name in logs)
 
 
 def turning(component: Component) -> bool:
@@ -171,7 +174,8 @@ class Adopted:
 
     def channels(self, x: Excitation) -> set[str]:
         """The logged channels that it follows."""
-        return followed(self.component, x, self.settings)
+        marks = profiled(self.component).items()
+        return {mark.pick(x, str(self.settings.get(name, ""))) for name, mark in marks if isinstance(mark, AnyChannel)}
 
     @property
     def late_s(self) -> float:
