@@ -30,7 +30,7 @@ TIME = " time"  # no channel has that name
 def explained_beside(state: State, model: Adopted, terms: Terms, assessment: Assessment) -> float:
     """Sum of squares that the adopted models explain whose next order may be all that a candidate shows: not of the
     reference what differs between the sensors, nor of some sensors what others show, nor of what follows the field
-    alone what is added to the axes with a channel or with time."""
+    alone what is added to the axes with a channel or with time, nor of an event what holds it."""
     between = seen_between(state.residual, terms, assessment.estimate.theta[-terms.count :])
     apart = terms.adds_to_axes and not generic(model) and bool(drivers(model, state.excitation))
     return explained_by(
@@ -40,6 +40,7 @@ def explained_beside(state: State, model: Adopted, terms: Terms, assessment: Ass
             for place, other in enumerate(state.adopted)
             if not (between and other.component.effect == "reference")
             and not (apart and _of_the_field_alone(other, state.excitation))
+            and not _holds(model, terms, state, place)
             and (not other.sensors or _held_by(other.sensors, state, terms, assessment) > MOST)
         ],
     )
@@ -63,7 +64,7 @@ def _explained(state: State, by: set[str], model: Adopted, terms: Terms, assessm
         for place, other in enumerate(state.adopted)
         if other.name != model.name
         and not _of_one_moment(model, other, state.excitation)
-        and not (_of_one_moment(model, other, state.excitation, NEXT) and _holds(terms, state, place))
+        and not _holds(model, terms, state, place)
         and not (between and other.component.effect == "reference")
         and by & drivers(other, state.excitation)
         and _held_by(other.sensors or state.excitation.sensors, state, terms, assessment) > NEARLY_ALL
@@ -84,9 +85,11 @@ def _of_one_moment(model: Adopted, other: Adopted, x: Excitation, apart: int = 0
     return mine.size > 0 and mine.shape == theirs.shape and bool(np.all(np.abs(mine - theirs) <= apart))
 
 
-def _holds(terms: Terms, state: State, place: int) -> bool:
-    """Whether a candidate's terms would explain nearly all that an adopted effect explains: it is that effect with more
-    freedom, and no next order of it."""
+def _holds(model: Adopted, terms: Terms, state: State, place: int) -> bool:
+    """Whether a candidate is an adopted event with more freedom, and no next order of it: its terms would explain
+    nearly all that this explains."""
+    if not _of_one_moment(model, state.adopted[place], state.excitation, NEXT):
+        return False
     outputs = len(state.residual.noise)
     effect = state.adopted[place].terms(state.excitation).at(state.residual.samples)
     added = effect.contribution(state.theta[place], outputs).reshape(-1, outputs // 3, 3)
