@@ -180,7 +180,7 @@ def _in_whose_place(x: Excitation, settings: Mapping[str, Any], found: Mapping[t
     pairs = [(s, t) for s, t in place.items() if place.get(t) == s and s < t]
     words = [f"{s} and {t} have changed places" for s, t in pairs]
     words += [f"{s} is what {t} was" for s, t in place.items() if place.get(t) != s]
-    return f"from {settings['time_s']:.6g} s on {', '.join(words)}" if words else ""
+    return f"from {round(settings['time_s'], 1):.7g} s on {', '.join(words)}" if words else ""
 
 
 @error_model(
