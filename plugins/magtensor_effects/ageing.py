@@ -190,7 +190,11 @@ def _in_whose_place(x: Excitation, settings: Mapping[str, Any], found: Mapping[t
     pointwise=True,
     means=_in_whose_place,
 )
-def calibration_step(x: Excitation, *, time_s: EventTime = 0.0) -> Terms:
+def calibration_step(
+    x: Excitation,
+    *,
+    time_s: Annotated[float, EventTimes(20), Field(description="time of the change, s since the survey's start")] = 0.0,
+) -> Terms:
     """Each sensor has another C and another offset from a time on: what reads it is another sensor, or it was changed.
 
     Twelve coefficients a sensor: what every axis shows more of the sensor's own three outputs, and a jump of its

@@ -138,8 +138,9 @@ def test_a_scale_factor_follows_a_law_too() -> None:
     standing = trial(record, state, Fitting())
     after, steps = by_any_law(record, standing, Fitting(), [0], ALPHA, 30)
     assert len(steps) >= 1 and after.state.adopted[0].settings["times_field"]
-    assert after.error is not None and standing.error is not None
-    assert max(after.error[s] / standing.error[s] for s in record.sensors) < 0.7
+    assert after.blocks is not None and standing.blocks is not None
+    before = standing.blocks.rms()
+    assert max(e / before[s] for s, e in after.blocks.rms().items()) < 0.7
 
 
 def test_a_channel_that_explains_nothing_has_no_law() -> None:

@@ -12,7 +12,7 @@ from loop_cases import BASE, loaded, scenario
 
 from magtensor.loop.fitting.model import Adopted, Fitting
 from magtensor.loop.fitting.refit import joint_state
-from magtensor.loop.fitting.trial import Trial
+from magtensor.loop.fitting.trial import BlockErrors, Trial
 from magtensor.loop.searching import adopting, rounds
 from magtensor.loop.searching.keeping import UNEARNED, Fitted
 from magtensor.loop.searching.search import search
@@ -102,7 +102,8 @@ def test_what_fails_alone_is_kept_if_both_help(
 
     def standing(error: dict[str, float], adopted: int) -> Trial:
         state: Any = SimpleNamespace(adopted=(None,) * adopted, excitation=None)
-        return Trial(state, error, folds)
+        squares = np.array([list(error.values())] * 2) ** 2
+        return Trial(state, BlockErrors(tuple(error), np.ones((2, 2), dtype=int), squares, squares), folds)
 
     before, alone = standing({"S1": 1.0, "S2": 1.0}, 0), standing({"S1": 1.2, "S2": 0.9}, 1)
     first: Any = SimpleNamespace(model=SimpleNamespace(name="temperature_scale"), passes=True)
@@ -125,7 +126,8 @@ def test_what_fails_alone_is_kept_if_both_help(
     assert asked == [False]  # no third one is looked for
     assert (both is not None) == kept
     if both is not None:
-        assert both.standing is not None and both.standing.error == after
+        assert both.standing is not None and both.standing.blocks is not None
+        assert both.standing.blocks.rms() == after
         assert both.chosen is first and [step.adopted for step in both.then] == [second]
     # with no room for two nothing is tried
     assert rounds.Rounds([], 0, 1, 0.005, None, None).with_another(given, before, first, hurt, given) is None

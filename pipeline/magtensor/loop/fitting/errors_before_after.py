@@ -88,7 +88,24 @@ def held_out_error(
     -------
     The error block of `magtensor.accuracy.error_block`; None where the other folds do not determine a calibration.
     """
-    sensors = len(record.sensors)
+    found = held_out(record, adopted, how, start, keep, edges)
+    if found is None:
+        return None
+    b, reference = found
+    use = np.repeat(keep[:, None], len(record.sensors), axis=1)
+    return error_block(b, reference, tensor_of(b, record.position), use, list(record.sensors))
+
+
+def held_out(
+    record: Record,
+    adopted: Sequence[Adopted],
+    how: Fitting,
+    start: Sequence[Array],
+    keep: NDArray[np.bool_],
+    edges: NDArray[np.int_],
+) -> tuple[Array, Array | None] | None:
+    """Calibrated fields (N, S, 3) nT and total field (N,) nT, what is adopted taken off both, of folds calibrated each
+    with the others; None where these do not determine a calibration. The parameters are those of `held_out_error`."""
 
     def calibrated_fold(k: int) -> tuple[Array, Array | None] | None:
         test = slice(edges[k], edges[k + 1])
@@ -99,26 +116,23 @@ def held_out_error(
             state = joint_state(record, adopted, how, start, keep=train, seen=np.asarray(keep))
         except DataError:
             return None
-        raw, field = without(record, [a.terms(state.excitation) for a in adopted], state.theta)
-        matrix = np.linalg.inv(state.fit.forward @ nearest_frame(state.fit.forward))
-        return by_sensor(matrix, raw[test] - state.fit.offset), None if field is None else field[test]
+        return calibrated(record, state, test)
 
-    folds = shared_out(calibrated_fold, range(len(edges) - 1))
     b, reference = [], []
-    for fold in folds:
+    for fold in shared_out(calibrated_fold, range(len(edges) - 1)):
         if fold is None:
             return None
         b.append(fold[0])
         if fold[1] is not None:
             reference.append(fold[1])
-    field = np.concatenate(b)
-    return error_block(
-        field,
-        np.concatenate(reference) if reference else None,
-        tensor_of(field, record.position),
-        np.repeat(keep[:, None], sensors, axis=1),
-        list(record.sensors),
-    )
+    return np.concatenate(b), np.concatenate(reference) if reference else None
+
+
+def calibrated(record: Record, state: State, rows: slice) -> tuple[Array, Array | None]:
+    """Calibrated fields (n, S, 3) nT and total field (n,) nT of some samples, what is adopted taken off both."""
+    raw, field = without(record, [a.terms(state.excitation) for a in state.adopted], state.theta)
+    matrix = np.linalg.inv(state.fit.forward @ nearest_frame(state.fit.forward))
+    return by_sensor(matrix, raw[rows] - state.fit.offset), None if field is None else field[rows]
 
 
 def tensor_of(b: Array, position: Array | None) -> Array | None:

@@ -193,9 +193,9 @@ def borne_out(record: Record, state: State, how: Fitting, fixed: int) -> tuple[S
         for place in range(fixed, len(state.adopted)):
             without = trial(record, without_models(record, state, [place], how), how)
             without = on_the_folds_of(now, record, without, how)
-            if now.error is not None and without.error is not None:
-                errors = (np.array([t.error[s] for s in record.sensors]) for t in (now, without) if t.error)
-                after, before = (float(np.sqrt(np.mean(e**2))) for e in errors)
+            errors = without.beside(now)
+            if errors[0]:
+                before, after = (float(np.sqrt(np.mean(np.square(list(e.values()))))) for e in errors)
                 rises[place] = after / before / (1.0 if _lasts(state.adopted[place]) else 1.0 + WORST_RISE)
         worst = max(rises, key=lambda place: rises[place], default=None)
         if worst is None or rises[worst] <= 1.0:
