@@ -14,7 +14,8 @@ from magtensor.loop.evidence.assessment import assess
 from magtensor.loop.evidence.grams import Whitened
 from magtensor.loop.fitting.model import Adopted, Fitting, State
 from magtensor.loop.fitting.refit import joint_state
-from magtensor.loop.searching.exchange import exchange
+from magtensor.loop.fitting.trial import per_sample
+from magtensor.loop.searching.exchange import exchange, exchanged
 from magtensor.loop.searching.found import Step
 from magtensor.loop.searching.gates import Candidate
 from magtensor.registry import Registry
@@ -105,6 +106,27 @@ def test_what_predicts_better_takes_the_place_of_what_was_adopted(warms: bool) -
     if found is not None:
         assert found.better and found.other.model.name == "temperature_scale"
         assert "temperature_scale" in found.why and "better" in found.why
+
+
+def test_what_has_fewer_coefficients_need_not_fit_all_samples_as_well() -> None:
+    """A jump of one sensor's offset; a change of its whole calibration fits a little more noise, and predicts worse."""
+    registry = Registry.load()
+    added = np.zeros((1200, 4, 3))
+    added[700:, 0] = [9.0, 6.0, -5.0]
+    record = synthetic(53, noise_nT=0.5, turning_s=4.0, added=added)
+    state = linear_state(record)
+    whole, jump = (registry.find("error_model", name) for name in ("calibration_step", "offset_step"))
+    first, second = (looked_at(state, Adopted(m, {"time_s": 700.0}, ("S1",))) for m in (whole, jump))
+    assert first.passes and second.passes and first.terms.count > second.terms.count
+    adopted = [first.model, Adopted(registry.find("error_model", "cross_field"), {})]
+    both = joint_state(record, adopted, Fitting())
+    found = exchange(both, [Step(state, (first, second), first)], 0)
+    assert found is not None and found.better and found.fewer  # what this is about
+    instead = exchanged(record, both, [Step(state, (first, second), first)], Fitting(), 0, 2)
+    assert instead is not None
+    after = instead[0].state
+    assert per_sample(after) < per_sample(both)
+    assert [a.name for a in after.adopted] == ["cross_field", "offset_step"] and after.adopted[1].sensors == ("S1",)
 
 
 @pytest.mark.long

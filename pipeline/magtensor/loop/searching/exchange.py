@@ -30,11 +30,13 @@ class Exchange:
     Attributes:
         place: of the adopted one; other: the model, as it was looked at in the round of that one.
         better: whether it predicts better; it does as well with fewer coefficients if not.
+        fewer: whether it has fewer coefficients.
     """
 
     place: int
     other: Candidate
     better: bool
+    fewer: bool
 
     @property
     def why(self) -> str:
@@ -69,10 +71,11 @@ def exchange(state: State, steps: Sequence[Step], fixed: int) -> Exchange | None
         mine = fold_gain(without, state.colours, state.terms.only(range(own.start, own.stop)))
         for other in sorted(others, key=lambda c: c.terms.count):
             theirs = fold_gain(without, state.colours, other.model.terms(state.excitation).at(state.residual.samples))
+            fewer = other.terms.count < size
             if separated(theirs, mine):
-                return Exchange(place, other, True)
-            if other.terms.count < size and not separated(mine, theirs):
-                return Exchange(place, other, False)
+                return Exchange(place, other, True, fewer)
+            if fewer and not separated(mine, theirs):
+                return Exchange(place, other, False, fewer)
     return None
 
 
@@ -91,7 +94,9 @@ def exchanged(
         return None
     before = trial(record, without, how)
     tried = fitted(record, before, chosen, how)
-    if tried.after is None or tried.why or (found.better and per_sample(tried.after.state) <= per_sample(state)):
+    if tried.after is None or tried.why:
+        return None
+    if not found.fewer and per_sample(tried.after.state) <= per_sample(state):  # with fewer it fits all a little less
         return None
     rivals = () if found.better else (old,)
     return tried.after, Step(without, (chosen,), chosen, rivals, refused={old: found.why})

@@ -32,7 +32,7 @@ from magtensor.loop.searching.profiling import already
 from magtensor.loop.searching.rivals import hardly_begun
 
 NOT_AS_ASSUMED = "fitted, its coefficients are not what its settings assume"
-ONE_OF_A_KIND = "fitted, its settings are those of what is adopted already"  # its law is no single one
+ONE_OF_A_KIND = "fitted, it comes out the same as one that is adopted already"  # its law is no single one
 MOST_OF_DIFFERENCES = 0.1  # positions wrong by a tenth of the array, where its law ends to be of first order
 UNEARNED = "fitted, it does not earn its place on held-out blocks"
 
