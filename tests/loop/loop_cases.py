@@ -162,3 +162,13 @@ def synthetic(
         attitude=None,
         samples=np.arange(samples),
     )
+
+
+def flicker(rng: np.random.Generator, shape: tuple[int, ...], crossing: float = 0.02) -> Array:
+    """White noise of unit variance plus 1/f noise as strong at the frequency `crossing` (cycles a sample)."""
+    n = shape[0]
+    f = np.fft.rfftfreq(2 * n)
+    f[0] = f[1]
+    spectrum = np.fft.rfft(rng.standard_normal((2 * n, *shape[1:])), axis=0)
+    slow = np.fft.irfft(spectrum * np.sqrt(crossing / f).reshape(-1, *[1] * (len(shape) - 1)), axis=0)[:n]
+    return slow + rng.standard_normal(shape)

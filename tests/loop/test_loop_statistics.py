@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from loop_cases import Array, linear_state, synthetic
+from loop_cases import Array, flicker, linear_state, synthetic
 from scipy.stats import kstest
 
 from magtensor.calibration.mixture import likeliest_mixture
@@ -25,16 +25,6 @@ from magtensor.loop.fitting.record import CLEARANCE
 from magtensor.loop.searching.gates import ALPHA
 
 WHITE = Colour(None, 1.0)
-
-
-def flicker(rng: np.random.Generator, shape: tuple[int, ...], crossing: float = 0.02) -> Array:
-    """White noise of unit variance plus 1/f noise as strong at the frequency `crossing` (cycles a sample)."""
-    n = shape[0]
-    f = np.fft.rfftfreq(2 * n)
-    f[0] = f[1]
-    spectrum = np.fft.rfft(rng.standard_normal((2 * n, *shape[1:])), axis=0)
-    slow = np.fft.irfft(spectrum * np.sqrt(crossing / f).reshape(-1, *[1] * (len(shape) - 1)), axis=0)[:n]
-    return slow + rng.standard_normal(shape)
 
 
 @pytest.mark.parametrize("stiff", [False, True])

@@ -7,7 +7,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from loop_cases import RECIPE, lasting_effects, scenario, survey_file, suspects, verdict_of
+from loop_cases import BASE, RECIPE, lasting_effects, scenario, survey_file, suspects, verdict_of
 
 from magtensor.applying import apply_and_refine
 from magtensor.loop.fitting.seen import over_disturbances
@@ -25,7 +25,9 @@ def spiked(path: Path) -> None:
     with h5py.File(path, "a") as file:
         raw = file["b_raw"][:]
         at = rng.choice(len(raw), SPIKES, replace=False)
-        raw[at, rng.integers(0, 4, SPIKES), rng.integers(0, 3, SPIKES)] += 5000.0 * rng.standard_normal(SPIKES)
+        raw[at, rng.integers(0, raw.shape[1], SPIKES), rng.integers(0, 3, SPIKES)] += 5000.0 * rng.standard_normal(
+            SPIKES
+        )
         file["b_raw"][:] = raw
 
 
@@ -45,6 +47,23 @@ def test_neither_blocks_held_out_nor_another_survey_see_them(tmp_path: Path) -> 
         off = np.linalg.norm(survey.values("calibrated/b"), axis=2) - survey.values("total_field")[:, None]
         off = off[survey.good_by_sensor.all(axis=1)]
         assert len(off) > 2300 and np.sqrt(np.mean(off**2)) < 0.3 and np.abs(off).max() < 3.0
+
+
+def test_the_phase_of_a_tone_is_not_theirs(tmp_path: Path) -> None:
+    """A tone of one of three sensors, in another phase in another survey; only their differences show it."""
+    three = BASE["instrument"] | {"array": {"shape": "triangle", "baseline_m": 0.5}}
+    surveys = [survey_file(tmp_path, scenario(seed, instrument=three), f"{seed}.h5") for seed in (52, 53)]
+    for path, phase in zip(surveys, (0.4, 2.0), strict=True):
+        with h5py.File(path, "a") as file:
+            tone = np.sin(2.0 * np.pi * 0.383 * file["time"][:] + phase)
+            file["b_raw"][:, 1] += tone[:, None] * np.array([1.0, 2.0, -1.5])
+        spiked(path)
+    plan = read_plan(RECIPE, survey=surveys[0], overrides=["stages.close_loop.search=[periodic_interference]"])
+    made = run(plan, empty_survey(plan)).survey
+    assert [a["error_model"] for a in verdict(made)["adopted"]] == ["periodic_interference"]
+    other, _ = apply_and_refine(made, surveys[1], plan, tolerant=True, refine_rotation=False)
+    off = np.linalg.norm(other.values("calibrated/b"), axis=2) - other.values("total_field")[:, None]
+    assert np.sqrt(np.mean(off[other.good_by_sensor.all(axis=1)] ** 2)) < 0.3
 
 
 @pytest.mark.long

@@ -17,6 +17,7 @@ from magtensor.calibration.types import Array, ArrayCalibration
 from magtensor.error_models.excitation import Excitation
 from magtensor.error_models.settings import Beginning, profiled
 from magtensor.loop.fitting.model import Adopted, Record
+from magtensor.loop.fitting.seen import over_disturbances
 from magtensor.tensor.geometry import array_design
 
 TONE = "periodic_interference"
@@ -28,17 +29,26 @@ LEAST_PARTS = 8  # of the survey, whose means tell how large slow noise is
 
 
 def as_begun_here(
-    record: Record, calibration: ArrayCalibration, own: Sequence[tuple[Adopted, Array]]
+    record: Record,
+    calibration: ArrayCalibration,
+    own: Sequence[tuple[Adopted, Array]],
+    good: NDArray[np.bool_] | None = None,
 ) -> list[tuple[Adopted, Array]]:
-    """Effects with their coefficients, as they are on a survey that began otherwise than the calibration's."""
-    begun = [(a, _tone_here(record, calibration, a, t) if a.name == TONE else t) for a, t in own]
+    """Effects with their coefficients, as they are on a survey that began otherwise than the calibration's.
+
+    Parameters
+    ----------
+    good: (N,) samples that may be believed; all that there are if None.
+    """
+    begun = [(a, _tone_here(record, calibration, a, t, good) if a.name == TONE else t) for a, t in own]
     begun = [
-        (a, _warmth_here(record, calibration, begun, i) if a.name == WARM_UP else t) for i, (a, t) in enumerate(begun)
+        (a, _warmth_here(record, calibration, begun, i, good) if a.name == WARM_UP else t)
+        for i, (a, t) in enumerate(begun)
     ]
     for number, (model, theta) in enumerate(begun):
         names = unknown(model)
         if names:
-            state = _state_here(record, calibration, begun, number, names)
+            state = _state_here(record, calibration, begun, number, names, good)
             begun[number] = replace(model, settings={**model.settings, **state}), theta
     return begun
 
@@ -59,13 +69,14 @@ class _Contrast:
     usable: NDArray[np.bool_]
 
     @classmethod
-    def of(cls, record: Record, calibration: ArrayCalibration) -> _Contrast:
+    def of(cls, record: Record, calibration: ArrayCalibration, good: NDArray[np.bool_] | None = None) -> _Contrast:
         sensors = record.raw.shape[1]
         held = np.tile(np.eye(3), (sensors, 1))
         if record.position is not None and sensors > 3:
             held = array_design(record.position, "gradient")
         free = np.eye(3 * sensors) - held @ np.linalg.pinv(held, rcond=1e-9)
-        return cls(calibration, free, np.asarray(np.isfinite(record.raw).all(axis=(1, 2))))
+        usable = np.isfinite(record.raw).all(axis=(1, 2))
+        return cls(calibration, free, np.asarray(usable if good is None else usable & good))
 
     def __call__(self, outputs: Array) -> Array:
         """(n, 3 S) of outputs (N, S, 3), at the usable samples."""
@@ -74,7 +85,9 @@ class _Contrast:
         return out
 
 
-def _tone_here(record: Record, calibration: ArrayCalibration, model: Adopted, theta: Array) -> Array:
+def _tone_here(
+    record: Record, calibration: ArrayCalibration, model: Adopted, theta: Array, good: NDArray[np.bool_] | None
+) -> Array:
     """Coefficients of a tone with the phase and strength it has on this survey; what one survey began with is another's
     accident.
 
@@ -82,8 +95,8 @@ def _tone_here(record: Record, calibration: ArrayCalibration, model: Adopted, th
     gradient can make of the outputs (with fewer than four sensors: in their differences). A single sensor, and a tone
     that all sensors see alike, leave it unknown, and nothing is taken off.
     """
-    contrast = _Contrast.of(record, calibration)
-    raw = np.where(contrast.usable[:, None, None], record.raw, 0.0)
+    contrast = _Contrast.of(record, calibration, good)
+    raw = np.nan_to_num(record.raw)
     terms = model.terms(record.excitation(raw, raw))
     half = len(theta) // 2  # cosines first, then sines
     later = np.concatenate([theta[half:], -theta[:half]])
@@ -100,7 +113,11 @@ def _tone_here(record: Record, calibration: ArrayCalibration, model: Adopted, th
 
 
 def _warmth_here(
-    record: Record, calibration: ArrayCalibration, own: Sequence[tuple[Adopted, Array]], number: int
+    record: Record,
+    calibration: ArrayCalibration,
+    own: Sequence[tuple[Adopted, Array]],
+    number: int,
+    good: NDArray[np.bool_] | None,
 ) -> Array:
     """Coefficients of a warming up as far as it had come when this survey began: the same course, in another strength.
 
@@ -110,7 +127,7 @@ def _warmth_here(
     model, theta = own[number]
     if not shows_a_state(record.raw, record.position is not None):
         return theta
-    here = Here.of(record, calibration)
+    here = Here.of(record, calibration, good)
     left, course = here.left(own), here.added(model, theta)
     if not len(left):
         return theta
@@ -129,6 +146,7 @@ def _state_here(
     own: Sequence[tuple[Adopted, Array]],
     number: int,
     names: Sequence[str],
+    good: NDArray[np.bool_] | None,
 ) -> dict[str, float]:
     """What the lagged response of one of the effects was out of equilibrium by when the survey began: settings.
 
@@ -141,7 +159,7 @@ def _state_here(
     none = dict.fromkeys(names, 0.0)
     if not shows_a_state(record.raw, record.position is not None):
         return none
-    here = Here.of(record, calibration)
+    here = Here.of(record, calibration, good)
     model, theta = own[number]
     left = here.left(own)
     rest = here.added(model, theta)
@@ -169,9 +187,9 @@ class Here:
     excitation: Excitation
 
     @classmethod
-    def of(cls, record: Record, calibration: ArrayCalibration) -> Here:
-        contrast = _Contrast.of(record, calibration)
-        b = calibration.apply(np.where(contrast.usable[:, None, None], record.raw, 0.0))
+    def of(cls, record: Record, calibration: ArrayCalibration, good: NDArray[np.bool_] | None = None) -> Here:
+        contrast = _Contrast.of(record, calibration, good)
+        b = over_disturbances(calibration.apply(np.nan_to_num(record.raw)), contrast.usable, record.time, record.run)
         forward = np.asarray(np.linalg.inv(calibration.matrix), dtype=float)
         x = record.excitation(by_sensor(forward, b) + calibration.offset, b, matrix=forward)
         return cls(record, calibration, contrast, x)

@@ -74,7 +74,7 @@ def corrected_raw(
     record = replace(record, raw=_on_time(record, each, [t for _, t in own], good))
     raw = record.raw
     own = [pair for terms, pair in zip(each, own, strict=True) if terms.delay is None]
-    own = as_begun_here(record, calibration, own)
+    own = as_begun_here(record, calibration, own, good)
     models, theta = [model for model, _ in own], [t for _, t in own]
     last = np.inf
     for _ in range(MOST_STEPS if own else 0):
