@@ -14,9 +14,10 @@ from magtensor.errors import DataError
 from .types import Array
 
 LARGEST_DISAGREEMENT = 0.1  # of F: twice the largest error that raw sensors of the catalogue have
+LARGEST_BEFORE_EFFECTS = 0.3  # of F, by what a thermometer may explain yet; what sees another field differs by F
 
 
-def require_agreement(b: Array, total_field: Array) -> None:
+def require_agreement(b: Array, total_field: Array, largest: float = LARGEST_DISAGREEMENT) -> None:
     """Refuse a sensor that does not see the field that the others see.
 
     The median over the samples is judged, so that spikes do not decide.
@@ -25,6 +26,7 @@ def require_agreement(b: Array, total_field: Array) -> None:
     ----------
     b: (N, S, 3) nT, calibrated to one frame.
     total_field: (N,) nT.
+    largest: accepted disagreement, a part of the total field.
 
     Raises
     ------
@@ -35,7 +37,7 @@ def require_agreement(b: Array, total_field: Array) -> None:
     typical = np.median(b, axis=1, keepdims=True) if b.shape[1] > 2 else b[:, ::-1]
     away = np.median(np.linalg.norm(b - typical, axis=2), axis=0)
     worst = int(np.argmax(away))
-    if away[worst] <= LARGEST_DISAGREEMENT * float(np.mean(total_field)):
+    if away[worst] <= largest * float(np.mean(total_field)):
         return
     who = f"sensor {worst + 1} does" if b.shape[1] > 2 else "sensors 1, 2 do"
     others = "the others see" if b.shape[1] > 2 else "each other sees"

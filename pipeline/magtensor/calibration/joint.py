@@ -20,7 +20,7 @@ import numpy as np
 
 from magtensor.errors import DataError, NotEnoughData
 
-from .agreement import require_agreement
+from .agreement import LARGEST_BEFORE_EFFECTS, LARGEST_DISAGREEMENT, require_agreement
 from .axes import mirrored_words, turned_words
 from .blocks import Blocks, blocks_of
 from .by_sensor import by_sensor
@@ -178,7 +178,7 @@ def _accepted(
         stands_for=int(keep.sum()),
     )
     require_coverage(found)
-    refuse_sensors(forward, offset, raw, total_field)
+    refuse_sensors(forward, offset, raw, total_field, complete=level is None)
     return JointFit(forward, offset, plane, scalar, keep, found)
 
 
@@ -200,11 +200,13 @@ def _level(part: Together, plane: CommonField, scalar: ScalarFit, keep: Mask) ->
     return float(noise_std(field[:, None], part.total_field[keep])[0, 0])
 
 
-def refuse_sensors(forward: Array, offset: Array, raw: Array, total_field: Array) -> None:
-    """Mirrored sensors, and those that have nothing in common with the others, whose C is next to singular."""
+def refuse_sensors(forward: Array, offset: Array, raw: Array, total_field: Array, *, complete: bool = True) -> None:
+    """Mirrored sensors, and those that have nothing in common with the others, whose C is next to singular; what is not
+    complete may lack an effect by which a sensor differs so much."""
     some = slice(None, None, max(1, len(raw) // 20_000))
     correction = np.asarray(np.linalg.pinv(forward, rcond=1e-9), dtype=np.float64)
-    require_agreement(by_sensor(correction, raw[some] - offset), total_field[some])
+    largest = LARGEST_DISAGREEMENT if complete else LARGEST_BEFORE_EFFECTS
+    require_agreement(by_sensor(correction, raw[some] - offset), total_field[some], largest)
     words = mirrored_words(correction)
     if words:
         raise DataError(
