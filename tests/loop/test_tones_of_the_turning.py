@@ -98,10 +98,22 @@ def test_where_the_turning_has_lines(tmp_path: Path) -> None:
     seen = Rotation.from_euler("Z", (2 * np.pi * 0.02 * time)[:, None]).inv().apply([1.0, 0.0, 0.0])
     field = np.repeat(5e4 * seen[:, None], len(record.sensors), axis=1)
     x = replace(record.excitation(field, field), attitude=None, logged={})
-    line, none = turning_lines(x, [0.04, 0.033])
+    line, none = turning_lines(x, [0.04, 0.033], [0.0, 0.0])
     assert line == pytest.approx(0.5, rel=0.02)  # of cos(a)^2, and of cos(a) sin(a)
     assert none < 1e-5
     assert of_the_turning(x, [0.04, 0.04], [10.0, 1000.0]) == [True, False]  # a fiftieth of the field is no such law
+
+
+def test_a_tone_in_the_outputs_is_no_line_of_the_turning(tmp_path: Path) -> None:
+    """The rate of change of a direction that hardly turns is full of it; what turns has lines of another size."""
+    slow = {"motion": BASE["motion"] | {"rate_rms_deg_s": 1.0, "rate_time_s": 60.0}, "logging": {"attitude": True}}
+    record = loaded(tmp_path, scenario(74, **slow))
+    state = linear_state(record)
+    tone = np.sin(2 * np.pi * 0.83 * record.time)[:, None, None] * np.array([0.7, -0.4, 0.5])
+    x = state.excitation
+    x = record.excitation(x.output + tone, x.field + tone)
+    assert turning_lines(x, [0.83], [0.0])[0] > 0.0  # what this is about
+    assert of_the_turning(x, [0.83], [0.5]) == [False]
 
 
 @pytest.mark.parametrize(("frequency", "doubted"), [(0.05, True), (0.9, False)])

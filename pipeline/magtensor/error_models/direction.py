@@ -12,6 +12,8 @@ from magtensor.error_models.excitation import VECTORS, Excitation
 
 LINE = 20.0  # power over the median of what is beside it: one in ten thousand by chance, in the largest of a hundred
 KNOTS = 17  # of a curve: an eighth of the field apart, which offsets of an array's sensors do not blur
+OF_A_TONE = 3.0  # times what a tone of the outputs makes of a line itself, that the platform's turning makes more
+DEGREE = 3  # of the field's direction, the largest
 WIDTH = 4  # frequencies, a survey's length apart, beyond which the window shows nothing of a line
 BESIDE = np.array([s * k for k in range(WIDTH, 31, 3) for s in (-1, 1)])  # such frequencies, the nearest first
 
@@ -69,15 +71,35 @@ def turning_Hz(x: Excitation) -> float:
     return float(np.sqrt(squares / (2.0 if len(axes) == 3 else 1.0)) / (2.0 * np.pi))  # three axes show a turn twice
 
 
-def turning_lines(x: Excitation, frequencies_Hz: Sequence[float]) -> Array:
+def turning_lines(x: Excitation, frequencies_Hz: Sequence[float], tones_nT: Sequence[float]) -> Array:
     """(F,) the largest amplitude with which the attitude, in units of its own series, has a line at each frequency; 0
-    where none of them has. Any law of the attitude has one there, with a memory or without."""
-    return largest_lines(attitude_series(x), x, frequencies_Hz) if len(frequencies_Hz) else np.zeros(0)
+    where none of them has. Any law of the attitude has one there, with a memory or without.
+
+    Parameters
+    ----------
+    tones_nT: (F,) amplitudes of the outputs' own lines, which the direction that is made of the outputs has too, and
+        its rate of change far more.
+    """
+    if not len(frequencies_Hz):
+        return np.zeros(0)
+    total = float(np.median(np.linalg.norm(x.field[:, 0], axis=1)))
+    least = OF_A_TONE * np.array([_of_a_tone(x, f) * a / total for f, a in zip(frequencies_Hz, tones_nT, strict=True)])
+    return largest_lines(attitude_series(x), x, frequencies_Hz, least)
 
 
-def largest_lines(series: Array, x: Excitation, frequencies_Hz: Sequence[float]) -> Array:
+def _of_a_tone(x: Excitation, frequency_Hz: float) -> Array:
+    """(K,) the most that the series of `attitude_series` show of a change of the direction by one."""
+    rate = x.derivative(_unit(x.field[:, 0]))
+    rates = 3 if (spread := rate.std()) > 0 else 0
+    others = direction_series(x).shape[1] - rates
+    quick = 2.0 * np.pi * frequency_Hz / max(spread, 1e-300)
+    logged = attitude_series(x).shape[1] - others - rates
+    return np.concatenate([np.full(others, float(DEGREE)), np.full(rates, quick), np.full(logged, float(DEGREE))])
+
+
+def largest_lines(series: Array, x: Excitation, frequencies_Hz: Sequence[float], least: Array | None = None) -> Array:
     """(F,) the largest amplitude with which one of several series (N, K) has a line at each frequency; 0 where none of
-    them has."""
+    them has, or none of more than (F, K) `least`."""
     window = np.blackman(len(series) + 2)[1:-1]
     window /= window.sum()
     series = (series - window @ series) * window[:, None]
@@ -89,6 +111,8 @@ def largest_lines(series: Array, x: Excitation, frequencies_Hz: Sequence[float])
         here, *beside = 2.0 * np.abs(turned @ series)
         next_to_it = np.max(beside[:2], axis=0)  # larger on the skirts of another line
         line = (here**2 > LINE * np.median(beside, axis=0) ** 2) & (here > next_to_it)
+        if least is not None:
+            line &= here > least[i]
         out[i] = np.max(here, initial=0.0, where=line)
     return out
 

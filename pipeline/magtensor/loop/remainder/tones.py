@@ -32,8 +32,9 @@ def tones(state: State, time: Array) -> tuple[float, ...]:
 def of_the_turning(x: Excitation, frequencies_Hz: Sequence[float], rms_nT: Sequence[float]) -> list[bool]:
     """Whether a law of the attitude may make lines of that rms."""
     total = float(np.median(np.linalg.norm(x.field[:, 0], axis=1)))
-    most = LARGEST_LAW * total * turning_lines(x, frequencies_Hz)
-    return [np.sqrt(2.0) * rms < largest for rms, largest in zip(rms_nT, most.tolist(), strict=True)]
+    amplitudes = [float(np.sqrt(2.0) * rms) for rms in rms_nT]
+    most = LARGEST_LAW * total * turning_lines(x, frequencies_Hz, amplitudes)
+    return [own < largest for own, largest in zip(amplitudes, most.tolist(), strict=True)]
 
 
 def channels_of_the_line(x: Excitation, frequency_Hz: float) -> tuple[str, ...]:
