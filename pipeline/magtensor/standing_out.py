@@ -2,7 +2,7 @@
 
 Another survey may cross any field, so that only the outputs are judged which neither a uniform field nor a gradient
 moves. Even there a near source shows, and a range that ends, and an effect nobody knows: but not for one sample and
-its neighbour only. Along a gradient, which three sensors in a plane do not tell from a disturbance of one, only what is
+its neighbour only. Along a gradient, which three sensors in a plane do not tell from a disturbance of one and two never do, only what is
 far beyond anything beside it.
 """
 
@@ -49,23 +49,24 @@ def flagged(survey: Survey, calibration: ArrayCalibration, noise: Array | None, 
     gradient: Array | None = None
     if uniform:
         parts.append(outputs @ free_directions(field))
-    elif (design := _of_gradients(survey, forward)) is not None:
-        free = free_directions(design / noise.reshape(-1, 1))
-        off_field = free_directions(field)
-        parts.append(outputs @ free)
-        gradient = outputs @ off_field @ free_directions(off_field.T @ free)
+    else:
+        gradient = outputs @ (off_field := free_directions(field))
+        if (design := _of_gradients(survey, forward)) is not None:
+            free = free_directions(design / noise.reshape(-1, 1))
+            parts.append(outputs @ free)
+            gradient = gradient @ free_directions(off_field.T @ free)
     parts = [p for p in parts if p.shape[1]]
     if uniform and "total_field" in survey:
         total_field = survey.values("total_field")
         usable = usable & np.isfinite(total_field)
         magnitude = np.linalg.norm(calibration.apply(np.nan_to_num(raw)), axis=2)
         parts.append((magnitude.mean(axis=1) - np.nan_to_num(total_field))[:, None])
-    if not parts or usable.sum() < LEAST_FOR_REJECTION:
+    if gradient is not None and not gradient.shape[1]:
+        gradient = None
+    if (gradient is None and not parts) or usable.sum() < LEAST_FOR_REJECTION:
         return survey
     alone = np.zeros(len(raw), dtype=bool)
-    alone[usable] = standing_out(
-        [part[usable] for part in parts], None if gradient is None or not gradient.shape[1] else gradient[usable]
-    )
+    alone[usable] = standing_out([part[usable] for part in parts], None if gradient is None else gradient[usable])
     if not alone.any():
         return survey
     good = survey.good_by_sensor & ~alone[:, None]
@@ -82,7 +83,8 @@ def standing_out(parts: list[Array], gradient: Array | None = None) -> Mask:
     The level of the noise is that of the whole, or of the surroundings where these are noisier. Of N clean samples none
     is taken with a probability of 0.99.
     """
-    found = _beyond_noise(parts, gradient, np.zeros(len(parts[0]), dtype=bool))
+    count = len(parts[0] if gradient is None else gradient)
+    found = _beyond_noise(parts, gradient, np.zeros(count, dtype=bool))
     out = found & _beyond_noise(parts, gradient, found)  # one of the first round may have had such neighbours
     for start, stop in in_a_row(out):
         if stop - start > LONGEST:
@@ -109,7 +111,7 @@ def _beyond_noise(parts: list[Array], gradient: Array | None, doubted: Mask) -> 
                 beyond &= np.mean(each**2, axis=1) > bend
         for each in apart:
             square = np.sum((each / scale) ** 2, axis=1)
-            level = np.maximum(np.median(square), median_filter(square, size=SURROUNDINGS, mode="nearest"))
+            level = np.maximum(np.median(square), median_filter(square, size=SURROUNDINGS, mode="reflect"))
             beyond &= square > limit * level
         out |= beyond
     return out if gradient is None else out | _without_foot(gradient, doubted)

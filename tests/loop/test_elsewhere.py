@@ -213,12 +213,16 @@ def test_spikes_of_another_survey_are_flagged(tmp_path: Path, folder: Path, plai
 
 
 def test_a_survey_of_two_sensors_whose_places_are_known(tmp_path: Path) -> None:
-    """Field and gradient together can make any outputs of two sensors: nothing stands out."""
+    """Field and gradient together can make any outputs of two sensors: nothing stands out but what has no foot."""
     pair = scenario(5, motion=MOTION)
     pair["instrument"] = pair["instrument"] | {"array": {"positions_m": [[0.25, 0.0, 0.0], [-0.25, 0.0, 0.0]]}}
     calibration = magtensor.close_loop(survey_file(tmp_path, pair, "pair.h5"), search=[]).calibration
-    calibrated = calibration.apply(survey_file(tmp_path, pair | {"seed": 6}, "another.h5"))
-    assert calibrated["calibrated/good"].all()
+    another = survey_file(tmp_path, pair | {"seed": 6}, "another.h5")
+    assert calibration.apply(another)["calibrated/good"].all()
+    with h5py.File(another, "a") as file:
+        file["b_raw"][100, 0] += [3000.0, 1000.0, -2000.0]
+    good = calibration.apply(another)["calibrated/good"].values
+    assert np.flatnonzero(good == 0).tolist() == [100]
 
 
 @pytest.mark.long
@@ -274,6 +278,14 @@ def test_what_lasts_is_left_to_speak_for_itself() -> None:
     values[300:310] += 30.0
     values[400:] += 30.0
     assert np.flatnonzero(standing_out([values])).tolist() == [100, 200, 201]
+
+
+@pytest.mark.parametrize("at", [0, 1, 2, 5, 597, 599])
+def test_near_an_end_a_spike_stands_out_however_large(at: int) -> None:
+    """Beside an end one sample serves as both its neighbours."""
+    values = np.random.default_rng(1).standard_normal((600, 1))
+    values[at] += 1e6
+    assert np.flatnonzero(standing_out([values])).tolist() == [at]
 
 
 def crossing(baselines: float, a_sample: float) -> NDArray[np.float64]:
