@@ -2,8 +2,8 @@
 
 Another survey may cross any field, so that only the outputs are judged which neither a uniform field nor a gradient
 moves. Even there a near source shows, and a range that ends, and an effect nobody knows: but not for one sample and
-its neighbour only. Along a gradient, which three sensors in a plane do not tell from a disturbance of one and two never do, only what is
-far beyond anything beside it.
+its neighbour only. Along a gradient, which three sensors in a plane do not tell from a disturbance of one and two
+sensors never do, only what is far beyond anything beside it.
 """
 
 from __future__ import annotations

@@ -96,7 +96,8 @@ def sentence(outcome: dict[str, Any]) -> str:
             falls = True
             shown = _figures(held_out["before"], held_out["after"])
             told = f"{shown} on held-out blocks{noise}; the errors {where} do not show it: {figures}"
-        head = "The residual was traced to" if falls else "No error falls, but the residual looks like"
+        none = f"No error falls{f' {where}' if shown_there else ''}, but the residual looks like"
+        head = "The residual was traced to" if falls else none
         head += f" {', '.join(adopted)}"
         head += f"; adopted by hand: {', '.join(by_hand)}" if by_hand else ""
     elif by_hand:

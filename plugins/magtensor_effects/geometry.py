@@ -1,7 +1,8 @@
 """Error models of where the sensors are. They show in a gradient only: no calibration in a uniform field tests them."""
 
+from collections.abc import Mapping
 from dataclasses import replace
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from pydantic import Field
@@ -13,11 +14,32 @@ from magtensor.error_models.settings import Choice
 from magtensor.error_models.terms import Terms, joined
 from magtensor_effects.temperature import THERMOMETER, Thermometer
 
+LEAST_TURNED = 3  # sensors: the shifts of two are a turn but for what is along the line between them
+MOST_OF_A_TURN = 0.9  # of the squares of the shifts; by chance of three sensors in 5 %, of four in 0.3 %
+
 
 def _positions(x: Excitation) -> Array:
     if x.position is None:
         raise KeyError("the survey has no positions")
     return x.position
+
+
+def _turned_together(x: Excitation, settings: Mapping[str, Any], found: Mapping[tuple[str, str], float]) -> str:
+    """How much of the shifts is one turn of the whole array, which attitudes that are turned against it show too."""
+    sensors = list(dict.fromkeys(s for s, _ in found))
+    if len(sensors) < LEAST_TURNED:
+        return ""
+    places = dict(zip(x.sensors, 1e3 * _positions(x), strict=True))  # mm
+    place = np.array([places[s] for s in sensors])
+    shift = np.array([[found[s, axis] for axis in "xyz"] for s in sensors])
+    place, shift = place - place.mean(axis=0), shift - shift.mean(axis=0)
+    by_each = np.stack([np.cross(axis, place).ravel() for axis in np.eye(3)], axis=1)  # of a turn by one
+    turn = np.linalg.lstsq(by_each, shift.ravel(), rcond=1e-6)[0]
+    share = float(np.sum((by_each @ turn) ** 2) / max(np.sum(shift**2), 1e-300))
+    if share < MOST_OF_A_TURN:
+        return ""
+    angle = np.rad2deg(float(np.linalg.norm(turn)))
+    return f"{share:.0%} of it is one turn of all places by {angle:.2g} deg: the attitudes may be turned by that"
 
 
 @error_model(
@@ -26,13 +48,15 @@ def _positions(x: Excitation) -> Array:
     source="Taylor series of the field",
     typical="1 nT for 1 mm in 1000 nT/m",
     pointwise=True,
+    means=_turned_together,
 )
 def position_error(x: Excitation) -> Terms:
     """A sensor's centre is not where the survey says: it sees the gradient times the offset.
 
     Three coefficients a sensor, true minus stated position. The gradient is that of the whole array, so a shift
     common to all sensors does not show; beside an unknown source at the site, an array larger than it should be does
-    not, for a stronger source is the same.
+    not, for a stronger source is the same. Attitudes that are turned against the array are nearly the same as an array
+    that is turned against them.
     """
     place = _positions(x)
     per_mm = [x.sensed(np.broadcast_to(1e-3 * x.gradient[:, None, :, axis], x.output.shape)) for axis in range(3)]

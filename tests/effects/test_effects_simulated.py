@@ -567,3 +567,23 @@ def test_who_is_in_whose_place() -> None:
     assert means(x, {"time_s": 50.0}, found) == "from 50 s on S1 is what S2 was, S2 is what S3 was, S3 is what S1 was"
     two = {key: value for key, value in found.items() if key[0] == "S4"}
     assert means(x, {"time_s": 50.0}, two) == ""
+
+
+def test_shifts_that_are_a_turn_of_the_array() -> None:
+    """By a degree about a slanted axis, to a tenth of what it makes; and shifts that no turn makes."""
+    x = excitation(simulated("offset_step", nT=[0.0, 0.0, 0.0], time_s=[50.0]))
+    assert x.position is not None
+    slanted = np.deg2rad(1.0) * np.array([0.6, 0.0, 0.8])
+    turned = 1e3 * np.cross(slanted, x.position)
+    rest = 0.1 * turned.std() * np.random.default_rng(1).standard_normal(turned.shape)
+    means = model("position_error").means
+    assert means is not None
+
+    def of(shift: np.ndarray) -> str:
+        named = {(s, axis): shift[i, k] for i, s in enumerate(x.sensors) for k, axis in enumerate("xyz")}
+        return means(x, {}, named)
+
+    assert "is one turn of all places by 1 deg" in of(turned + rest)
+    assert of(turned + np.array([1.0, -2.0, 3.0])).startswith("100%")  # a shift of all does not show
+    assert of(1e3 * 0.01 * x.position) == ""
+    assert means(x, {}, {("S1", a): 1.0 for a in "xyz"} | {("S2", a): 2.0 for a in "xyz"}) == ""

@@ -377,7 +377,9 @@ def shared_words(found: Sought, sensors: Sequence[str]) -> str:
     if found.like is not None:
         name, lag, power, correlation = found.like
         to_the = "" if power == 1 else f" to the power {power}"
-        words += f" and is most like channel {name}{to_the} with a lag of {lag:.3g} s (correlation {correlation:+.2f})"
+        words += (
+            f" and is most like channel {name}{to_the} with a lag of {lag:.3g} s (correlation {abs(correlation):.2f})"
+        )
         if independent(found.values) < FEW:
             words += ", as one of several channels, powers and lags is of anything that swings so seldom"
     else:

@@ -80,7 +80,7 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
     if words:
         in_use = " at the samples in use" if flagged.mean() > MANY_FLAGGED else ""
         size = f"{excess:.3g} nT rms above the white noise{in_use}, {_where(state)}"
-        words.insert(0, size if excess else "in sum no more than the white noise")
+        words.insert(0, size if excess else "in sum no more than the white noise, but no noise alone")
     beside += [sparse.words] if sparse is not None else suspects.noise_words
     beside += [*suspects.small_words, *([began] if began else [])]
     if record.absent:
