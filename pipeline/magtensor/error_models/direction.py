@@ -82,19 +82,14 @@ def turning_lines(x: Excitation, frequencies_Hz: Sequence[float], tones_nT: Sequ
     """
     if not len(frequencies_Hz):
         return np.zeros(0)
+    series = attitude_series(x)
     total = float(np.median(np.linalg.norm(x.field[:, 0], axis=1)))
-    least = OF_A_TONE * np.array([_of_a_tone(x, f) * a / total for f, a in zip(frequencies_Hz, tones_nT, strict=True)])
-    return largest_lines(attitude_series(x), x, frequencies_Hz, least)
-
-
-def _of_a_tone(x: Excitation, frequency_Hz: float) -> Array:
-    """(K,) the most that the series of `attitude_series` show of a change of the direction by one."""
-    rate = x.derivative(_unit(x.field[:, 0]))
-    rates = 3 if (spread := rate.std()) > 0 else 0
-    others = direction_series(x).shape[1] - rates
-    quick = 2.0 * np.pi * frequency_Hz / max(spread, 1e-300)
-    logged = attitude_series(x).shape[1] - others - rates
-    return np.concatenate([np.full(others, float(DEGREE)), np.full(rates, quick), np.full(logged, float(DEGREE))])
+    rate = x.derivative(_unit(x.field[:, 0])).std()
+    shown = np.full((len(frequencies_Hz), series.shape[1]), float(DEGREE))  # of a change of the direction by one
+    if rate > 0:  # the last of the series that are made of the direction alone
+        last = direction_series(x).shape[1]
+        shown[:, last - 3 : last] = 2.0 * np.pi * np.asarray(frequencies_Hz)[:, None] / rate
+    return largest_lines(series, x, frequencies_Hz, OF_A_TONE * shown * np.asarray(tones_nT)[:, None] / total)
 
 
 def largest_lines(series: Array, x: Excitation, frequencies_Hz: Sequence[float], least: Array | None = None) -> Array:
