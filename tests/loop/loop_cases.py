@@ -12,9 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtensor.error_models.settings import EventTimes, profiled
-from magtensor.loop.fitting.model import Fitting, Record, State
+from magtensor.loop.evidence.assessment import assess
+from magtensor.loop.evidence.grams import Whitened
+from magtensor.loop.fitting.model import Adopted, Fitting, Record, State
 from magtensor.loop.fitting.record import record_of
 from magtensor.loop.fitting.refit import joint_state
+from magtensor.loop.searching.gates import Candidate
 from magtensor.preparing import empty_survey, load_as
 from magtensor.recipe.plan import read_plan
 from magtensor.registry import Registry
@@ -172,3 +175,11 @@ def flicker(rng: np.random.Generator, shape: tuple[int, ...], crossing: float = 
     spectrum = np.fft.rfft(rng.standard_normal((2 * n, *shape[1:])), axis=0)
     slow = np.fft.irfft(spectrum * np.sqrt(crossing / f).reshape(-1, *[1] * (len(shape) - 1)), axis=0)[:n]
     return slow + rng.standard_normal(shape)
+
+
+def looked_at(state: State, model: Adopted) -> Candidate:
+    """A model as a candidate, its settings given."""
+    terms = model.terms(state.excitation).at(state.residual.samples)
+    white = Whitened.of(state.residual, state.colours.across, state.colours.along, state.terms)
+    found = assess(white, terms)
+    return Candidate(model, 1.0, terms, found, found.p, found.own_p, found.null_p)

@@ -8,16 +8,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from loop_cases import BASE, adopted_names, linear_state, scenario, synthetic, verdict_of
+from loop_cases import BASE, adopted_names, linear_state, looked_at, scenario, synthetic, verdict_of
 
-from magtensor.loop.evidence.assessment import assess
-from magtensor.loop.evidence.grams import Whitened
-from magtensor.loop.fitting.model import Adopted, Fitting, State
+from magtensor.loop.fitting.model import Adopted, Fitting
 from magtensor.loop.fitting.refit import joint_state
 from magtensor.loop.fitting.trial import per_sample
 from magtensor.loop.searching.exchange import exchange, exchanged
 from magtensor.loop.searching.found import Step
-from magtensor.loop.searching.gates import Candidate
 from magtensor.registry import Registry
 
 MODELS = ("site_gradient", "fixed_source", "nonlinearity_cubic")
@@ -141,10 +138,3 @@ def test_a_temperature_refused_for_a_drift_beside_a_flexure_is_asked_again(tmp_p
         told = verdict_of(tmp_path, scenario(seed, *effects, motion=motion, logging=logging), models=models)
         assert adopted_names(told) == {"frame_flexure", "temperature_alignment"}
         assert not told["unexplained"]["present"], told["unexplained"]["description"]
-
-
-def looked_at(state: State, model: Adopted) -> Candidate:
-    terms = model.terms(state.excitation).at(state.residual.samples)
-    white = Whitened.of(state.residual, state.colours.across, state.colours.along, state.terms)
-    found = assess(white, terms)
-    return Candidate(model, 1.0, terms, found, found.p, found.own_p, found.null_p)

@@ -205,9 +205,10 @@ def test_what_the_calibration_has_already_is_refused(tmp_path: Path, explorer: E
     passing = {str(n) for n, row in explorer.ranking().iterrows() if row["passes"]}
     assert passing
     of_use = words.split("significant, passes the first two gates of the loop and is not adopted: ")[1].split("; ")[0]
-    assert passing & set(of_use.split(", "))
+    assert passing & {each.split(" at ")[0] for each in of_use.split(", ")}
     if "of no use on held-out blocks: " in words:
-        assert not passing & set(words.split("of no use on held-out blocks: ")[1].split("; ")[0].split(", "))
+        useless = words.split("of no use on held-out blocks: ")[1].split("; ")[0].split(", ")
+        assert not passing & {each.split(" at ")[0] for each in useless}
     partly = tmp_path / "partly.py"
     partly.write_text(PARTLY)
     assert explorer.load_plugin(partly) == ["partly"]

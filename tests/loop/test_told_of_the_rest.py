@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from loop_cases import Array, linear_state, synthetic
+from loop_cases import Array, linear_state, looked_at, synthetic
 
 from magtensor.loop.fitting.model import Adopted, Fitting, Record
 from magtensor.loop.fitting.refit import joint_state
 from magtensor.loop.remainder.flagged import flagged_words
 from magtensor.loop.remainder.predictable import converter_words
-from magtensor.loop.searching.found import Search
+from magtensor.loop.searching.found import Search, Step
 from magtensor.loop.searching.unexplained import loud_words, unexplained
 from magtensor.registry import Registry
 from magtensor.verdict import sentence
@@ -215,6 +215,22 @@ def test_what_was_adopted_more_than_once_is_counted_and_a_channel_named() -> Non
     assert "traced to 2 x offset_step, channel_response of throttle:" in sentence(outcome)
     adopted[2] |= {"error_model": "temperature_offset", "channels_as_good": ["intake", "room"]}
     assert "2 x offset_step, temperature_offset of throttle (or of intake or room):" in sentence(outcome)
+
+
+def test_when_something_happened_is_told_though_it_is_not_adopted() -> None:
+    """A jump, and an offset for a while, that passed and were refused."""
+    added = np.zeros((1200, 4, 3))
+    added[700:, 0] = [9.0, 6.0, -5.0]
+    added[300:600, 1] = [-4.0, 6.0, 5.0]
+    record = synthetic(53, noise_nT=0.5, turning_s=4.0, added=added)
+    state, find = linear_state(record), Registry.load().find
+    jump = Adopted(find("error_model", "offset_step"), {"time_s": 700.0}, ("S1",))
+    part = Adopted(find("error_model", "offset_while"), {"time_s": 300.0, "until_s": 600.0}, ("S2",))
+    seen = [looked_at(state, model) for model in (jump, part)]
+    step = Step(state, tuple(seen), None, refused={"offset_step": "for a reason"})
+    found = Search(state, state, (step,), {}, {}, record, None, Fitting())
+    words = str(unexplained(found, record)["description"])
+    assert "offset_step at 700 s (for a reason)" in words and "offset_while from 300 to 600 s" in words
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ from magtensor.loop.evidence.assessment import assess
 from magtensor.loop.evidence.grams import Whitened
 from magtensor.loop.fitting.model import State
 from magtensor.loop.remainder.sparse_readings import SparseReadings
-from magtensor.loop.searching.contribution import happens_once
+from magtensor.loop.searching.contribution import happens_once, moments
 from magtensor.loop.searching.found import Search
 from magtensor.loop.searching.gates import SECOND_ORDER, Candidate
 from magtensor.loop.searching.keeping import NOT_AS_ASSUMED
@@ -62,14 +62,16 @@ class Suspects:
         ]  # fmt: skip
         adopted = {a.name for a in found.last.adopted}
 
-        def named(name: str) -> str:
-            return f"another {name}" if name in adopted else name
+        def named(candidate: Candidate) -> str:
+            name, when = candidate.model.name, [f"{t:.4g}" for t in moments(candidate.model)]
+            at = f" from {when[0]} to {when[1]} s" if len(when) == 2 else f" at {when[0]} s" if when else ""
+            return f"{'another ' * (name in adopted)}{name}{at}"
 
-        open_ = [c.model.name for c in suspects if c.passes]
+        open_ = [(c, refused.get(c.model.name)) for c in suspects if c.passes]
         near = sorted((c for c in last if c.adjusted_p < NEAR), key=lambda c: c.adjusted_p)
         return cls(
-            [f"{named(name)} ({refused[name]})" if name in refused else named(name) for name in open_],
-            [named(c.model.name) for c in suspects if not c.passes],
+            [f"{named(c)} ({why})" if why else named(c) for c, why in open_],
+            [named(c) for c in suspects if not c.passes],
             [c.model.name for c in seen if c.model.name not in noisy and c.of_second_order],
             [c.model.name for c in seen if c.model.name in noisy],
             [c.model.name for c in near if sparse is None or c.model.name not in noisy][:MOST_NEAREST],
