@@ -14,6 +14,7 @@ from magtensor.loop.fitting.trial import Trial, on_the_folds_of, trial
 from magtensor.loop.remainder.changing_matrix import channel_instead
 from magtensor.loop.remainder.curve_of_a_channel import event_of_a_curve
 from magtensor.loop.searching.adopting import adopt, on_all_sensors, polished
+from magtensor.loop.searching.after_a_pause import left_by_a_pause
 from magtensor.loop.searching.beginnings import at_its_limit, began_with_a_vector
 from magtensor.loop.searching.contribution import (
     agrees,
@@ -131,6 +132,8 @@ def why_not(record: Record, before: Trial, after: Trial, chosen: Candidate, how:
     theta = chosen.assessment.theta[-chosen.terms.count :]
     seen = chosen.before or before.state  # at the samples of its terms
     if happens_once(model):
+        if name := left_by_a_pause(after.state, which):
+            return f"it follows a pause of the record, in which nobody knows what {name} came to"
         # fitted without it the other may have had a part of it, and so its vectors
         if (name := event_along(seen, chosen.terms, theta)) and _along_another(after.state, which):
             return f"it lies along the vectors of {name}, whose law may leave it"
