@@ -116,7 +116,7 @@ def held_out(
             state = joint_state(record, adopted, how, start, keep=train, seen=np.asarray(keep))
         except DataError:
             return None
-        return calibrated(record, state, test)
+        return calibrated_fields(record, state, test)
 
     b, reference = [], []
     for fold in shared_out(calibrated_fold, range(len(edges) - 1)):
@@ -128,7 +128,7 @@ def held_out(
     return np.concatenate(b), np.concatenate(reference) if reference else None
 
 
-def calibrated(record: Record, state: State, rows: slice) -> tuple[Array, Array | None]:
+def calibrated_fields(record: Record, state: State, rows: slice) -> tuple[Array, Array | None]:
     """Calibrated fields (n, S, 3) nT and total field (n,) nT of some samples, what is adopted taken off both."""
     raw, field = without(record, [a.terms(state.excitation) for a in state.adopted], state.theta)
     matrix = np.linalg.inv(state.fit.forward @ nearest_frame(state.fit.forward))

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from magtensor.calibration.types import Array
 from magtensor.loop.evidence.assessment import log_likelihood
-from magtensor.loop.fitting.errors_before_after import calibrated, folds_for, held_out
+from magtensor.loop.fitting.errors_before_after import calibrated_fields, folds_for, held_out
 from magtensor.loop.fitting.model import Fitting, Record, State
 
 WORST_RISE = 0.10  # of a sensor's |b| - F on held-out blocks; a dozen coefficients cost a hundred samples half of that
@@ -107,7 +107,7 @@ def _judged(record: Record, state: State, how: Fitting, keep: NDArray[np.bool_],
     if found is None or found[1] is None:
         return Trial(state, None, folds)
     (apart, samples), (within, _) = (
-        _squares(b, field, keep, folds) for b, field in (found, calibrated(record, state, slice(None)))
+        _squares(b, field, keep, folds) for b, field in (found, calibrated_fields(record, state, slice(None)))
     )
     return Trial(state, BlockErrors(record.sensors, samples, apart, within), folds)
 
