@@ -34,7 +34,7 @@ from loop_power import Trial, models, simulated
 from loop_surveys import EFFECTS, recorded
 
 from magtensor.errors import MagtensorError
-from magtensor.loop.fitting.errors_before_after import folds_for, held_out_error
+from magtensor.loop.fitting.errors_before_after import folds_for, held_out, held_out_error
 from magtensor.loop.fitting.model import Fitting
 from magtensor.loop.searching.contribution import removal
 from magtensor.loop.searching.search import search
@@ -60,6 +60,9 @@ def tried(trial: Trial) -> dict[str, Any]:
         return row | {"outcome": "cannot be", "description": str(error).splitlines()[0]}
     last = found.last
     left = unexplained(found, found.record)
+    keep, folds = last.fit.keep, folds_for(last)
+    before = held_out(record, [], how, [], keep, folds)
+    after = held_out(found.record, last.adopted, how, last.theta, keep, folds)
     return row | {
         "outcome": "rival" if last.adopted else "told" if left["present"] else "silent",
         "adopted": [a.name for a in last.adopted],
@@ -67,8 +70,8 @@ def tried(trial: Trial) -> dict[str, Any]:
         "description": left["description"],
         "looks_like": left["looks_like"],
         "left": float(np.sqrt(last.residual.square())),
-        "before": _all(held_out_error(record, [], how, [], last.fit.keep, folds_for(last))),
-        "after": _all(held_out_error(found.record, last.adopted, how, last.theta, last.fit.keep, folds_for(last))),
+        "before": _all(held_out_error(record, before, keep)),
+        "after": _all(held_out_error(found.record, after, keep)),
         "removal": [removal(last, i) for i in range(len(last.adopted))],
     }
 

@@ -74,7 +74,7 @@ def close_loop(
     from magtensor.loop.decisions import Decision, decision_of
     from magtensor.loop.evidence.own_noise import OwnNoise
     from magtensor.loop.fitting import refit
-    from magtensor.loop.fitting.errors_before_after import folds_for, held_out_error
+    from magtensor.loop.fitting.errors_before_after import folds_for, held_out, held_out_error
     from magtensor.loop.fitting.model import Fitting, unread
     from magtensor.loop.inquiry import inquiry_of
     from magtensor.loop.near_nominal import doubt_of, labelled, settled
@@ -107,10 +107,14 @@ def close_loop(
     looked_at, keep = found.record, found.last.fit.keep
     left = unexplained(found, looked_at)
     folds = folds_for(found.last)
-    before = held_out_error(looked_at, begin, inquiry.how, found.first.theta, keep, folds)
+    first_folds = held_out(looked_at, begin, inquiry.how, found.first.theta, keep, folds)
+    before = held_out_error(looked_at, first_folds, keep)
     same = len(found.last.adopted) == len(begin)
     seen = as_elsewhere(looked_at, calibrated(found.last.fit), found.last)
-    after = before if same else held_out_error(seen, found.last.adopted, how, found.last.theta, keep, folds)
+    after = before
+    if not same:
+        last_folds = held_out(seen, found.last.adopted, how, found.last.theta, keep, folds)
+        after = held_out_error(seen, last_folds, keep)
     slow = slow_noise_variables(OwnNoise(found.told.residual, None).slow_std())
     found = inquiry.on_every_sample(found)
     first, last, record = found.first, refit.with_colour(found.record, found.last, how), found.record

@@ -63,6 +63,17 @@ def test_noise_has_none(slow: bool) -> None:
     assert np.mean(np.array(smallest) < 0.05) <= 0.2
 
 
+def test_missing_samples_make_a_tone_no_weaker() -> None:
+    """A fifth of the survey is missing, and what is left lies on no grid."""
+    time = uneven(3, 0.3)
+    tone = np.sin(2.0 * np.pi * FREQUENCY_HZ * time + 0.4)
+    record = at(time, 61, 3.0 * tone[:, None, None] * np.random.default_rng(5).standard_normal((4, 3)))
+    some = record.at(np.flatnonzero((time < 900.0) | (time > 1380.0)))
+    every, fewer = (spectral_lines(linear_state(r).residual, r.time)[0] for r in (record, some))
+    assert fewer[0] == pytest.approx(FREQUENCY_HZ, abs=1.0 / SAMPLES)
+    assert fewer[1] == pytest.approx(every[1], rel=0.05)
+
+
 def test_too_few_samples_for_their_time_have_none() -> None:
     """A third of the survey is missing, and the rest lies on no grid."""
     time = uneven(3, 0.3)

@@ -46,7 +46,8 @@ def spectral_lines(residual: Residual, time: Array, most: int = 5) -> list[tuple
         size /= np.sqrt(np.interp(np.arange(1.0, len(size) + 1) / n, _cycles(colour.power), colour.power))
     k = coordinates.shape[1]
     # without the highest frequency of an even number of samples, which has one phase and not two
-    spectrum = (_of_a_grid if even else transform)(coordinates, places, n)[1 : (n + 1) // 2]
+    spectrum = _of_a_grid(coordinates, places, n) if even else transform(coordinates, places, n) * (n / len(places))
+    spectrum = spectrum[1 : (n + 1) // 2]
     power = np.sum(np.abs(spectrum @ _alike(coordinates)) ** 2, axis=1) / n
     frequency = np.arange(1, len(power) + 1) / (n * step)
     width = max(len(power) // 100, 15)

@@ -67,28 +67,10 @@ def _known_without_each(terms: Terms, edges: NDArray[np.int_]) -> Array:
 
 
 def held_out_error(
-    record: Record,
-    adopted: Sequence[Adopted],
-    how: Fitting,
-    start: Sequence[Array],
-    keep: NDArray[np.bool_],
-    edges: NDArray[np.int_],
+    record: Record, found: tuple[Array, Array | None] | None, keep: NDArray[np.bool_]
 ) -> dict[str, Any] | None:
-    """Error figures over contiguous folds, each calibrated with the samples of the others.
-
-    Parameters
-    ----------
-    record: the samples.
-    adopted: the error models, with their settings; their coefficients are fitted anew for every fold.
-    start: coefficients to begin with; what they converge to does not depend on them.
-    keep: (N,) samples that a fit may believe.
-    edges: (folds + 1,) where the folds begin and end (`folds_for`); errors are comparable over the same ones.
-
-    Returns
-    -------
-    The error block of `magtensor.accuracy.error_block`; None where the other folds do not determine a calibration.
-    """
-    found = held_out(record, adopted, how, start, keep, edges)
+    """The error block of `magtensor.accuracy.error_block` over the samples (N,) in use of what `held_out` found; None
+    of None."""
     if found is None:
         return None
     b, reference = found
@@ -104,8 +86,21 @@ def held_out(
     keep: NDArray[np.bool_],
     edges: NDArray[np.int_],
 ) -> tuple[Array, Array | None] | None:
-    """Calibrated fields (N, S, 3) nT and total field (N,) nT, what is adopted taken off both, of folds calibrated each
-    with the others; None where these do not determine a calibration. The parameters are those of `held_out_error`."""
+    """Contiguous folds, each calibrated with the samples of the others.
+
+    Parameters
+    ----------
+    record: the samples.
+    adopted: the error models, with their settings; their coefficients are fitted anew for every fold.
+    start: coefficients to begin with; what they converge to does not depend on them.
+    keep: (N,) samples that a fit may believe.
+    edges: (folds + 1,) where the folds begin and end (`folds_for`); errors are comparable over the same ones.
+
+    Returns
+    -------
+    Calibrated fields (N, S, 3) nT and total field (N,) nT, what is adopted taken off both; None where the other folds
+    do not determine a calibration.
+    """
 
     def calibrated_fold(k: int) -> tuple[Array, Array | None] | None:
         test = slice(edges[k], edges[k + 1])

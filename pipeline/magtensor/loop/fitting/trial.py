@@ -57,7 +57,7 @@ class Trial:
     Attributes:
         state: of the fit.
         blocks: its errors; None where blocks alone do not determine a calibration.
-        folds: the samples that each was judged on, as in `held_out_error`.
+        folds: the samples that each was judged on, as in `held_out`.
     """
 
     state: State
