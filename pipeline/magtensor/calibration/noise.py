@@ -36,11 +36,11 @@ def noise_std(b: Array, total_field: Array | None = None) -> Array:
         assert total_field is not None
         along = np.linalg.norm(b[:, 0], axis=1) - total_field
         return np.full((1, 3), second_difference_std(along[:, None])[0])
-    contrasts = b - b.mean(axis=1, keepdims=True)
-    variance = second_difference_std(contrasts.reshape(n, -1)).reshape(sensors, 3) ** 2
     if sensors == 2:  # the two contrasts are one and the same
         share = np.full(2, 0.5) if total_field is None else shares_of_two(b, total_field)
-        return np.sqrt(4.0 * variance * share[:, None])
+        return np.sqrt(share)[:, None] * second_difference_std(b[:, 0] - b[:, 1])
+    contrasts = b - b.mean(axis=1, keepdims=True)
+    variance = second_difference_std(contrasts.reshape(n, -1)).reshape(sensors, 3) ** 2
     # var(contrast_s) = (1 - 2/S) v_s + sum(v) / S^2 and sum over s gives sum(v) (1 - 1/S)
     total = variance.sum(axis=0) / (1.0 - 1.0 / sensors)
     own = (variance - total / sensors**2) / (1.0 - 2.0 / sensors)

@@ -26,7 +26,7 @@ from magtensor.errors import DataError, NotEnoughData
 from .agreement import require_agreement
 from .by_sensor import by_sensor
 from .common_field import CommonField
-from .coverage import WORST_ERROR, coverage
+from .coverage import WORST_ERROR, Coverage, coverage
 from .joint import JointFit, Posterior, nearest_frame
 from .joint_covariance import frame_projection
 from .joint_together import Found, Together, limits_of
@@ -81,6 +81,7 @@ def fit_nominal(
     complete: bool = True,
     quiet_field: Array | None = None,
     start: JointFit | None = None,
+    known: Coverage | None = None,
 ) -> JointFit:
     """Fit C and o of all sensors to their outputs and the total field, beside what is known of them beforehand.
 
@@ -89,8 +90,8 @@ def fit_nominal(
     raw: (N, S, 3) nT, finite; total_field: (N,) nT, positive. A total field that is a mere constant will do: what it
         errs by is a scale that all sensors share, within the prior.
     nominal: the prior.
-    noise, reference_noise, worst_error, keep, complete: as in `joint.fit_recording`. A complete model is also held
-        against the prior.
+    noise, reference_noise, worst_error, keep, complete, known: as in `joint.fit_recording`. A complete model is also
+        held against the prior.
     quiet_field: (N,) nT, the total field without the reference's own noise; the total field itself when None.
     start: a fit of nearly the same outputs, to begin with; sensors at nominal when None, and where it leads nowhere.
 
@@ -113,13 +114,15 @@ def fit_nominal(
     unit = float(np.mean(total_field[believed]))
     asked = _Asked(raw, total_field, unit, nominal.std(sensors), noise, reference_noise, keep)
     rows = np.tile(np.eye(3, 4), (sensors, 1))
-    ways = [(rows, settled), (rows, settled_slowly)]
+    ways: list[tuple[Array, Array | None, Callable[..., tuple[Here, Array, float]]]]
+    ways = [(rows, noise, settled), (rows, noise, settled_slowly)]
     if start is not None:
-        ways.insert(0, (np.column_stack([start.forward.reshape(-1, 3), start.offset.ravel() / unit]), settled))
+        near = np.column_stack([start.forward.reshape(-1, 3), start.offset.ravel() / unit])
+        ways.insert(0, (near, start.plane.noise, settled))
     found, refusal = None, NotEnoughData(DIVERGES, hint=HINT)
-    for begin, steps in ways:
+    for begin, own, steps in ways:
         try:
-            found = _fitted(asked, begin, steps, believed)
+            found = _fitted(asked, begin, own, steps, believed)
         except NotEnoughData as error:
             refusal = error
         if found is not None:
@@ -135,7 +138,7 @@ def fit_nominal(
     still = np.linalg.eigvalsh(np.cov(field.T))[0] < (QUIETEST * unit) ** 2
     if still:  # to the last digit: what the quietest sensor would add keeps it apart from a constant
         field = field + QUIETEST * unit * np.random.default_rng(0).standard_normal(field.shape)
-    return _found(data, here, covariance, nominal, believed, field, worst_error, complete)
+    return _found(data, here, covariance, nominal, believed, field, worst_error, complete, known)
 
 
 @dataclass(frozen=True)
@@ -152,10 +155,11 @@ class _Asked:
 
 
 def _fitted(
-    asked: _Asked, rows: Array, steps: Callable[..., tuple[Here, Array, float]], believed: Mask
+    asked: _Asked, rows: Array, own: Array | None, steps: Callable[..., tuple[Here, Array, float]], believed: Mask
 ) -> tuple[NominalData, Here, Array, Mask] | None:
-    """Parameters, noise and believed samples in turn until they rest, from given parameters rows (3 S, 4); None where
-    that goes astray: steps that do not end, or noise beyond what the outputs can hold.
+    """Parameters, noise and believed samples in turn until they rest, from given parameters rows (3 S, 4) and, unless
+    None, noise own (3 S,); None where that goes astray: steps that do not end, or noise beyond what the outputs can
+    hold.
 
     Raises
     ------
@@ -164,8 +168,7 @@ def _fitted(
     raw, total_field, unit = asked.raw, asked.total_field, asked.unit
     flat = raw.reshape(len(raw), -1)
     loudest = LOUDEST * _rms(np.maximum(second_difference_std(flat[believed]), QUIETEST * unit))
-    given = None if asked.noise is None else np.asarray(asked.noise).ravel()
-    own = _noise(rows, flat, total_field, unit, believed) if given is None else given
+    own = _noise(rows, flat, total_field, unit, believed) if own is None else np.asarray(own).ravel()
     weights = (0.0, 0.0)
     for round_ in range(_ROUNDS):
         data = NominalData(flat[believed], total_field[believed], unit, own, asked.reference_noise)
@@ -178,7 +181,7 @@ def _fitted(
             again = _believed(data, here, raw, total_field, asked.reference_noise, believed)
             rests = rests and np.array_equal(again, believed)
             believed = again
-        if given is None:
+        if asked.noise is None:
             now = _noise(rows, flat, total_field, unit, believed)
             if not _rms(now) <= loudest:  # nor where it is no number
                 return None
@@ -238,6 +241,7 @@ def _found(
     field: Array,
     worst_error: float,
     complete: bool,
+    known: Coverage | None,
 ) -> JointFit:
     sensors = len(here.rows) // 3
     forward, offset = here.rows[:, :3].reshape(sensors, 3, 3), here.rows[:, 3].reshape(sensors, 3) * data.unit
@@ -245,7 +249,7 @@ def _found(
     plane = CommonField(data.noise, here.plane.basis, here.plane.mean, len(data.x), chi2)
     scalar = ScalarFit(here.matrix, here.offset, float(np.mean(here.along**2)), NOTHING)
     q = nearest_frame(forward)
-    seen = coverage(
+    seen = known or coverage(
         scalar.field(plane.coordinates(data.x)) @ q, data.total_field, matrix=np.eye(3), offset=np.zeros(3),
         worst_error=worst_error, noise=None if complete else float(np.sqrt(np.mean(data.noise**2))),
     )  # fmt: skip

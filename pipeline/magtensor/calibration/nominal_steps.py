@@ -9,7 +9,7 @@ import numpy as np
 from magtensor.errors import NotEnoughData
 
 from .common_field import CommonField
-from .maximum_likelihood import along
+from .maximum_likelihood import along, products_of
 from .types import Array
 
 BLOCKS = (120, 30, 12)
@@ -44,9 +44,10 @@ class Here:
     inverse_std: Array
 
     def inner(self, direction: Array, z: Array) -> Array:
-        """(N, 12) change of the residual along with each coordinate of the plane times z (N, 4)."""
-        gain = self.inverse_std[:, None] * (direction @ self.matrix)
-        return np.asarray((gain[:, :, None] * z[:, None]).reshape(len(z), 12))
+        """(12, N) change of the residual along with each coordinate of the plane times z (4, N), for directions (N, 3)
+        of the field."""
+        gain = self.matrix.T @ (direction * self.inverse_std[:, None]).T
+        return np.asarray((gain[:, None] * z).reshape(12, -1))
 
 
 @dataclass(frozen=True)
@@ -89,26 +90,27 @@ class NominalData:
         """
         across, inside = weights
         apart = np.linalg.inv(basis)
-        z = self._seen(here) @ apart
+        z = apart.T @ self._seen(here).T
         towards = _neighbours(here.field)
         towards /= np.linalg.norm(towards, axis=1, keepdims=True)
-        other = np.column_stack([towards * (self.total_field / self.unit)[:, None], np.ones(len(z))]) @ apart
+        other = apart.T @ np.vstack([towards.T * (self.total_field / self.unit), np.ones(len(towards))])
         scale = self.unit / self.noise
         off = (np.eye(len(scale)) - here.plane.basis @ here.plane.basis.T) * np.outer(scale, scale)
-        score = across * ((here.across * scale).T @ other).ravel()
-        change = across * np.kron(off, other.T @ z)
-        covariance = across * np.kron(off, other.T @ other)
-        own, theirs = here.inner(here.direction, z), here.inner(towards, other)
+        score = across * ((here.across * scale).T @ other.T).ravel()
+        change = across * np.kron(off, other @ z.T)
+        covariance = across * np.kron(off, other @ other.T)
+        rows = np.vstack([here.inner(towards, other), here.inner(here.direction, z), here.along])
+        sums = products_of(rows, 12, 0, rows.shape[1])
         into = np.kron(here.plane.basis.T * scale, np.eye(4))
-        score = score + inside * into.T @ (theirs.T @ here.along)
-        change = change + inside * into.T @ (theirs.T @ own) @ into
-        covariance = covariance + inside * into.T @ (theirs.T @ theirs) @ into
+        score = score + inside * into.T @ sums[:, 24]
+        change = change + inside * into.T @ sums[:, 12:24] @ into
+        covariance = covariance + inside * into.T @ sums[:, :12] @ into
         return np.asarray(score), np.asarray(change), np.asarray(covariance)
 
     def misfit(self, here: Here) -> tuple[Array | None, Array]:
         """Residual across (N, 3 S), None for one sensor, and along (N, 1), less what C and o could still explain."""
         z = np.column_stack([here.direction * (self.total_field / self.unit)[:, None], np.ones(len(here.field))])
-        inside = least(here.along[:, None], here.inner(here.direction, z))
+        inside = least(here.along[:, None], here.inner(here.direction, z.T).T)
         return (least(here.across, z) if len(self.noise) > 3 else None), inside
 
 

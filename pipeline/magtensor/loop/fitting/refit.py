@@ -234,7 +234,11 @@ def _fit(
         }  # fmt: skip
         if how.nominal is None:
             return fit_recording(InMemory(raw, reference, None if usable.all() else usable), known=known, **options)
-        return fit_nominal(raw, reference, how.nominal, quiet_field=reference - loud, start=start, **options)
+        # what is searched near nominal is not refused for its attitudes
+        seen = start.coverage if start is not None and how.searching else known
+        return fit_nominal(
+            raw, reference, how.nominal, quiet_field=reference - loud, start=start, known=seen, **options
+        )
 
     try:
         fit = fitted(keep)
