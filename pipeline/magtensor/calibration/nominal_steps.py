@@ -90,10 +90,10 @@ class NominalData:
         """
         across, inside = weights
         apart = np.linalg.inv(basis)
-        z = apart.T @ self._seen(here).T
+        z: Array = apart.T @ self._seen(here).T
         towards = _neighbours(here.field)
         towards /= np.linalg.norm(towards, axis=1, keepdims=True)
-        other = apart.T @ np.vstack([towards.T * (self.total_field / self.unit), np.ones(len(towards))])
+        other: Array = apart.T @ np.vstack([towards.T * (self.total_field / self.unit), np.ones(len(towards))])
         scale = self.unit / self.noise
         off = (np.eye(len(scale)) - here.plane.basis @ here.plane.basis.T) * np.outer(scale, scale)
         score = across * ((here.across * scale).T @ other.T).ravel()
