@@ -89,7 +89,7 @@ class NominalData:
         A residual times what the field of the neighbouring samples would make it: their noise is not in the residual.
         """
         across, inside = weights
-        apart = np.linalg.inv(basis)
+        apart = np.asarray(np.linalg.inv(basis), dtype=np.float64)
         z: Array = apart.T @ self._seen(here).T
         towards = _neighbours(here.field)
         towards /= np.linalg.norm(towards, axis=1, keepdims=True)
