@@ -81,10 +81,6 @@ class Parameters:
     def __getitem__(self, name: str) -> float:
         return float(self.values[self.convention.names.index(name)])
 
-    def std_of(self, name: str) -> float:
-        """Standard deviation of one parameter."""
-        return float(self.std[self.convention.names.index(name)])
-
 
 def response(values: Array, convention: Convention) -> tuple[Array, Array]:
     """Response C (3, 3) and offset (3,) nT of twelve parameters in the internal order of `Convention`."""

@@ -188,13 +188,6 @@ def sampling_sentences(tables: Tables) -> list[str]:
     return found
 
 
-def as_plain(facts: FileFacts) -> dict[str, Any]:
-    """The same as numbers, texts, lists and mappings."""
-    from dataclasses import asdict
-
-    return asdict(facts)
-
-
 def show(file: Path, reader: str | None = None, plugin_folders: Sequence[Path] = ()) -> None:
     """Print what a file holds and the mapping to paste into a recipe.
 

@@ -34,7 +34,6 @@ _KINDS = {
 }
 _TEMPERATURE = re.compile(r"temp|tmp", re.IGNORECASE)
 _CURRENT = re.compile(r"current|curr|amp", re.IGNORECASE)
-_QUATERNION = re.compile(r"quat", re.IGNORECASE)
 _EULER = re.compile(r"^(roll|pitch|yaw|heading)", re.IGNORECASE)
 _UNIX_SCALES = (("s", 1e9, 4e9), ("ms", 1e12, 4e12), ("us", 1e15, 4e15), ("ns", 1e18, 4e18))
 _ROUND_FIELD_NT = 50_000.0  # what a guessed scale makes of the mean magnitude
