@@ -75,6 +75,15 @@ def test_a_fit_that_begins_with_another_ends_where_it_does_without() -> None:
     assert np.max(np.abs(off) / np.sqrt(np.diag(cold.posterior.covariance))) < 0.02
 
 
+def test_attitudes_that_were_judged_before_are_not_judged_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    raw, total_field = _observatory(4)
+    before = fit_nominal(raw, total_field, Nominal())
+    monkeypatch.setattr(nominal_module, "coverage", None)
+    again = fit_nominal(raw, total_field, Nominal(), known=before.coverage)
+    assert again.coverage is before.coverage
+    np.testing.assert_array_equal(again.forward, before.forward)
+
+
 def test_a_survey_that_determines_it_is_fitted_alike_with_and_without_the_prior() -> None:
     rng = np.random.default_rng(3)
     u = rng.standard_normal((2000, 3))
