@@ -59,22 +59,24 @@ class SlowModes:
         """(B, step, 3) the response, with zeros after the end."""
         return self._in_steps(self.response)
 
+    @cached_property
+    def _cosines(self) -> Array:
+        """(K, B), of unit length over the survey. Of so few a product takes less time than a transform, whatever B."""
+        blocks = len(self._held)
+        phase = np.pi / blocks * np.outer(np.arange(1, self.most + 1), np.arange(blocks) + 0.5)
+        return np.asarray(np.cos(phase) * np.sqrt(2.0 / len(self.response)))
+
     def seen_in(self, series: Array) -> Array:
         """(3 K, Q) products of (N, Q) with each cosine times response, three for each cosine, the slowest first."""
-        from scipy.fft import dct
-
         sums = self._held.transpose(0, 2, 1) @ self._in_steps(series)
-        out: Array = dct(sums, axis=0)[1 : self.most + 1] / np.sqrt(2.0 * len(series))
+        out: Array = self._cosines @ sums.reshape(len(sums), -1)
         return out.reshape(3 * self.most, -1)
 
     def made_of(self, coefficients: Array) -> Array:
         """(N, Q) series that have such coefficients (3 K, Q) in the cosines times response."""
-        from scipy.fft import dct
-
         k, q, n = self.most, coefficients.shape[1], len(self.response)
-        spectrum = np.zeros((len(self._held), 3, q))
-        spectrum[1 : k + 1] = coefficients.reshape(k, 3, q) / np.sqrt(2.0 * n)
-        out: Array = (self._held @ dct(spectrum, axis=0, type=3)).reshape(len(spectrum) * self.step, q)
+        each = (self._cosines.T @ coefficients.reshape(k, 3 * q)).reshape(-1, 3, q)
+        out: Array = (self._held @ each).reshape(-1, q)
         return out[:n]
 
     @cached_property
