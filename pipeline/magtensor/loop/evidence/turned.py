@@ -68,16 +68,17 @@ class SlowModes:
 
     def seen_in(self, series: Array) -> Array:
         """(3 K, Q) products of (N, Q) with each cosine times response, three for each cosine, the slowest first."""
+        q = series.shape[1]
         sums = self._held.transpose(0, 2, 1) @ self._in_steps(series)
-        out: Array = self._cosines @ sums.reshape(len(sums), -1)
-        return out.reshape(3 * self.most, -1)
+        out: Array = self._cosines @ sums.reshape(len(sums), 3 * q)
+        return out.reshape(3 * self.most, q)
 
     def made_of(self, coefficients: Array) -> Array:
         """(N, Q) series that have such coefficients (3 K, Q) in the cosines times response."""
-        k, q, n = self.most, coefficients.shape[1], len(self.response)
-        each = (self._cosines.T @ coefficients.reshape(k, 3 * q)).reshape(-1, 3, q)
-        out: Array = (self._held @ each).reshape(-1, q)
-        return out[:n]
+        k, q = self.most, coefficients.shape[1]
+        each = (self._cosines.T @ coefficients.reshape(k, 3 * q)).reshape(len(self._held), 3, q)
+        out: Array = (self._held @ each).reshape(len(self._held) * self.step, q)
+        return out[: len(self.response)]
 
     @cached_property
     def gram(self) -> Array:
