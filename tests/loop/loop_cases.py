@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from magtensor.error_models.settings import EventTimes, profiled
 from magtensor.loop.evidence.assessment import assess
 from magtensor.loop.evidence.grams import Whitened
+from magtensor.loop.evidence.spectrum import spectral_lines
 from magtensor.loop.fitting.model import Adopted, Fitting, Record, State
 from magtensor.loop.fitting.record import record_of
 from magtensor.loop.fitting.refit import joint_state
@@ -123,6 +124,12 @@ def loaded(folder: Path, description: dict[str, Any], change: Callable[[Path], N
 def linear_state(record: Record) -> State:
     """The joint fit with the linear model alone."""
     return joint_state(record, [], Fitting())
+
+
+def lines_left(record: Record) -> list[tuple[float, float, float]]:
+    """The strongest lines of what the linear model leaves."""
+    residual = linear_state(record).residual
+    return spectral_lines(residual, record.time[residual.samples])
 
 
 def synthetic(

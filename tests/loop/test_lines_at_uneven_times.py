@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from loop_cases import Array, flicker, linear_state, synthetic
+from loop_cases import Array, flicker, lines_left, synthetic
 
-from magtensor.loop.evidence.spectrum import spectral_lines, transform
+from magtensor.loop.evidence.spectrum import transform
 from magtensor.loop.fitting.model import Record
 
 SAMPLES = 2400
@@ -44,7 +44,7 @@ def test_a_tone_is_found(jitter_s: float) -> None:
     time = uneven(3, jitter_s)
     tone = np.sin(2.0 * np.pi * FREQUENCY_HZ * time + 0.4)
     record = at(time, 61, 0.4 * tone[:, None, None] * np.random.default_rng(5).standard_normal((4, 3)))
-    frequency, rms, p = spectral_lines(linear_state(record).residual, record.time)[0]
+    frequency, rms, p = lines_left(record)[0]
     assert frequency == pytest.approx(FREQUENCY_HZ, abs=1.0 / SAMPLES)
     assert p < 1e-6
     assert 0.15 < rms < 0.45  # 0.4 / sqrt 2 on the average of the axes, a fourth of it common to all sensors
@@ -57,8 +57,7 @@ def test_noise_has_none(slow: bool) -> None:
     for seed in range(20):
         noise = flicker(np.random.default_rng(seed), (SAMPLES, 4, 3), 1.0) if slow else np.zeros((SAMPLES, 4, 3))
         record = replace(synthetic(70 + seed, SAMPLES, added=3.0 * noise, turning_s=4.0), time=uneven(seed, 0.3))
-        residual = linear_state(record).residual
-        smallest.append(spectral_lines(residual, record.time[residual.samples])[0][2])
+        smallest.append(lines_left(record)[0][2])
     assert min(smallest) > 1e-3  # of 20 the smallest is below that once in 50 times
     assert np.mean(np.array(smallest) < 0.05) <= 0.2
 
@@ -69,7 +68,7 @@ def test_missing_samples_make_a_tone_no_weaker() -> None:
     tone = np.sin(2.0 * np.pi * FREQUENCY_HZ * time + 0.4)
     record = at(time, 61, 3.0 * tone[:, None, None] * np.random.default_rng(5).standard_normal((4, 3)))
     some = record.at(np.flatnonzero((time < 900.0) | (time > 1380.0)))
-    every, fewer = (spectral_lines(linear_state(r).residual, r.time)[0] for r in (record, some))
+    every, fewer = (lines_left(r)[0] for r in (record, some))
     assert fewer[0] == pytest.approx(FREQUENCY_HZ, abs=1.0 / SAMPLES)
     assert fewer[1] == pytest.approx(every[1], rel=0.05)
 
@@ -80,4 +79,4 @@ def test_too_few_samples_for_their_time_have_none() -> None:
     tone = np.sin(2.0 * np.pi * FREQUENCY_HZ * time)
     record = at(time, 61, tone[:, None, None] * np.random.default_rng(5).standard_normal((4, 3)))
     record = record.at(np.flatnonzero((time < 800.0) | (time > 1600.0)))
-    assert spectral_lines(linear_state(record).residual, record.time) == []
+    assert lines_left(record) == []

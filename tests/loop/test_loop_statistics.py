@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from loop_cases import Array, flicker, linear_state, synthetic
+from loop_cases import Array, flicker, linear_state, lines_left, synthetic
 from scipy.stats import kstest
 
 from magtensor.calibration.mixture import likeliest_mixture
@@ -18,9 +18,8 @@ from magtensor.loop.evidence.colour import Colour, colour_of
 from magtensor.loop.evidence.folds import block_count
 from magtensor.loop.evidence.gains import Gain
 from magtensor.loop.evidence.grams import grams
-from magtensor.loop.evidence.spectrum import spectral_lines
 from magtensor.loop.evidence.statistics import cauchy_combination, family_p, wald_p
-from magtensor.loop.fitting.model import Record, State
+from magtensor.loop.fitting.model import Record
 from magtensor.loop.fitting.record import CLEARANCE
 from magtensor.loop.searching.gates import ALPHA
 
@@ -161,13 +160,12 @@ def test_a_reference_without_its_noise() -> None:
     np.testing.assert_allclose(quieted(field, CLEARANCE), field, atol=0.05)
 
 
-def with_line(seed: int, amplitude: float, frequency: float = 0.083) -> tuple[State, Record]:
+def with_line(seed: int, amplitude: float, frequency: float = 0.083) -> Record:
     samples = 2400
     rng = np.random.default_rng(100 + seed)
     tone = np.sin(2 * np.pi * frequency * np.arange(samples) + 0.4)
     added = amplitude * tone[:, None, None] * rng.standard_normal((4, 3))
-    record = synthetic(seed, samples, added=added + 0.5 * flicker(rng, (samples, 4, 3)))
-    return linear_state(record), record
+    return synthetic(seed, samples, added=added + 0.5 * flicker(rng, (samples, 4, 3)))
 
 
 def test_few_readings_of_a_noisy_base_station_hold_no_field_but_their_trend() -> None:
@@ -182,12 +180,11 @@ def test_few_readings_of_a_noisy_base_station_hold_no_field_but_their_trend() ->
 
 
 def test_a_line_is_found_and_noise_has_none() -> None:
-    state, record = with_line(1, 0.3)
-    frequency, rms, p = spectral_lines(state.residual, record.time)[0]
+    frequency, rms, p = lines_left(with_line(1, 0.3))[0]
     assert frequency == pytest.approx(0.083, abs=1 / 2400)
     assert p < 1e-6
     assert 0.1 < rms < 0.35  # 0.3 / sqrt 2, a fourth of it common to all sensors
-    small = [spectral_lines(*_of(seed))[0][2] for seed in range(20)]
+    small = [lines_left(with_line(seed, 0.0))[0][2] for seed in range(20)]
     assert np.mean(np.array(small) < 0.05) <= 0.2
     assert min(small) > 1e-4
 
@@ -199,7 +196,7 @@ def test_what_is_loud_has_no_line(axes: list[int]) -> None:
         added = np.zeros((1200, 4, 3))
         added[:, 2, axes] = 30.0 * np.random.default_rng(seed).standard_normal((1200, len(axes)))
         record = synthetic(80 + seed, added=added, turning_s=20.0)
-        smallest.append(spectral_lines(linear_state(record).residual, record.time)[0][2])
+        smallest.append(lines_left(record)[0][2])
     assert min(smallest) > 1e-3  # of 20 the smallest is below that once in 50 times
     assert np.mean(np.array(smallest) < 0.05) <= 0.2
 
@@ -210,7 +207,7 @@ def test_slow_noise_on_a_platform_that_turns_is_no_line() -> None:
     for seed in range(10):
         walks = np.cumsum(np.random.default_rng(seed).standard_normal((1600, 4, 3)), axis=0)
         record = synthetic(40 + seed, 1600, added=walks, turning_s=3.0)
-        smallest.append(spectral_lines(linear_state(record).residual, record.time)[0][2])
+        smallest.append(lines_left(record)[0][2])
     assert min(smallest) > 0.01
 
 
@@ -224,8 +221,8 @@ def with_gaps(record: Record) -> Record:
 
 
 def test_missing_samples_hide_no_line() -> None:
-    record = with_gaps(with_line(1, 0.3)[1])
-    frequency, rms, p = spectral_lines(linear_state(record).residual, record.time)[0]
+    record = with_gaps(with_line(1, 0.3))
+    frequency, rms, p = lines_left(record)[0]
     assert frequency == pytest.approx(0.083, abs=1 / 2400)
     assert p < 1e-6
     assert 0.1 < rms < 0.35
@@ -236,10 +233,5 @@ def test_missing_samples_make_no_line_of_slow_noise() -> None:
     for seed in range(10):
         walks = np.cumsum(np.random.default_rng(seed).standard_normal((1600, 4, 3)), axis=0)
         record = with_gaps(synthetic(40 + seed, 1600, added=walks, turning_s=3.0))
-        smallest.append(spectral_lines(linear_state(record).residual, record.time)[0][2])
+        smallest.append(lines_left(record)[0][2])
     assert min(smallest) > 0.01
-
-
-def _of(seed: int) -> tuple:
-    state, record = with_line(seed, 0.0)
-    return state.residual, record.time

@@ -10,12 +10,11 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from loop_cases import BASE, Array, adopted_names, linear_state, loaded, scenario, synthetic, verdict_of
+from loop_cases import BASE, Array, adopted_names, linear_state, lines_left, loaded, scenario, synthetic, verdict_of
 from scipy.signal import StateSpace, lsim
 from scipy.spatial.transform import Rotation
 
 from magtensor.error_models.direction import turning_Hz, turning_lines
-from magtensor.loop.evidence.spectrum import spectral_lines
 from magtensor.loop.fitting.model import Adopted, Fitting
 from magtensor.loop.fitting.refit import joint_state
 from magtensor.loop.remainder.tones import channels_of_the_line, of_the_turning, tones
@@ -80,7 +79,7 @@ def test_a_dead_zone_is_no_tone(tmp_path: Path) -> None:
 def test_lines_of_a_part_that_swings_are_no_tones(tmp_path: Path) -> None:
     record = loaded(tmp_path, scenario(75), partial(steady, added=swinging))
     state = linear_state(record)
-    strongest, _, p = spectral_lines(state.residual, record.time[state.residual.samples])[0]
+    strongest, _, p = lines_left(record)[0]
     assert p < 1e-9  # what this is about
     assert strongest not in tones(state, record.time)
 
