@@ -166,6 +166,20 @@ def test_what_has_more_coefficients_elsewhere_may_be_the_same_effect(tmp_path: P
     np.testing.assert_allclose(found.state.theta[0], np.ravel(everywhere), atol=0.15)
 
 
+@pytest.mark.parametrize("true", [False, True])
+def test_an_event_on_another_sensor_may_be_the_same_law(tmp_path: Path, true: bool) -> None:
+    """Three sensors follow the temperature, and on one of them something is said to have jumped; or that one jumps."""
+    effects = [{"type": "temperature_offset", "rms_nT": 0.3, "sensors": ["S1", "S3"] if true else ["S1", "S2", "S3"]}]
+    if true:
+        effects.append({"type": "offset_step", "time_s": [400.0], "nT": [[0.5, -0.4, 0.3]], "sensors": ["S2"]})
+    record = loaded(tmp_path, getting_warmer(4, *effects, rate_Hz=1.0))
+    adopted = [model("offset_step", {"time_s": 400.0}, "S2"), model("temperature_offset", FOLLOWING, "S1", "S3")]
+    standing = trial(record, joint_state(record, adopted, Fitting()), Fitting())
+    found, gone = in_the_place_of_others(record, standing, Fitting(), [0, 1])
+    assert gone == (() if true else ("offset_step",))
+    assert found.state.adopted[-1].sensors == (("S1", "S3") if true else ("S1", "S2", "S3"))
+
+
 @pytest.mark.parametrize(
     ("total", "significant", "beside", "named"),
     [

@@ -20,7 +20,7 @@ from magtensor.loop.fitting.model import Adopted, Fitting, Record, State
 from magtensor.loop.fitting.refit import joint_state
 from magtensor.loop.fitting.separation import fold_gain, separated
 from magtensor.loop.fitting.trial import Trial, on_the_folds_of, trial
-from magtensor.loop.searching.contribution import KEEP_ALPHA, put_back_one, slices, without_models
+from magtensor.loop.searching.contribution import KEEP_ALPHA, happens_once, put_back_one, slices, without_models
 from magtensor.loop.searching.on_fewer_sensors import narrowed, sensors_showing
 
 
@@ -50,8 +50,8 @@ def in_the_place_of_others(
     record: Record, standing: Trial, how: Fitting, places: Sequence[int]
 ) -> tuple[Trial, tuple[str, ...]]:
     """The fit with some of the adopted models on the sensors, too, of another one of them that acts on none of their
-    own, and without that one, where held-out blocks do not tell the two apart and its coefficients are more; and the
-    names of those that are gone."""
+    own, and without that one, where held-out blocks do not tell the two apart and its coefficients are more, or as many
+    and it happens once; and the names of those that are gone."""
     gone: list[str] = []
     left = list(places)
     while (pair := _as_well(standing.state, left)) is not None:
@@ -78,7 +78,9 @@ def _as_well(state: State, places: Sequence[int]) -> tuple[int, int] | None:
             continue
         own = slices(state)[other]
         wider = replace(models[place], sensors=theirs).terms(x).at(state.residual.samples)
-        if not 0 < wider.count < own.stop - own.start:
+        most = own.stop - own.start
+        # a law that is in already is simpler than something that happens once
+        if not 0 < wider.count < most + (happens_once(models[other]) and not happens_once(models[place])):
             continue
         assert state.terms is not None
         without = put_back_one(state, other)

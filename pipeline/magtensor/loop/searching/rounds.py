@@ -134,9 +134,9 @@ class Rounds:
             steps.extend(adopted.then)
             if adopted.standing is not None:
                 record, state = renewed(record, adopted.standing.state, how)
-                earlier = range(self.fixed, len(state.adopted) - 1)
-                standing = on_more_sensors(record, replace(adopted.standing, state=state), how, earlier)
-                standing, gone = in_the_place_of_others(record, standing, how, earlier)
+                places = range(self.fixed, len(state.adopted))
+                standing = on_more_sensors(record, replace(adopted.standing, state=state), how, places[:-1])
+                standing, gone = in_the_place_of_others(record, standing, how, places)
                 state = standing.state
                 if gone:
                     steps[-1] = replace(steps[-1], dropped=(*steps[-1].dropped, *gone))

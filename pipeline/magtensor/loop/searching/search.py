@@ -28,6 +28,7 @@ from magtensor.loop.searching.found import Search, Step
 from magtensor.loop.searching.gates import ALPHA
 from magtensor.loop.searching.latent import NAME, SINGLE_STRETCH, renewed, sought
 from magtensor.loop.searching.on_fewer_sensors import on_those_that_show
+from magtensor.loop.searching.on_more_sensors import in_the_place_of_others
 from magtensor.loop.searching.overshadowed import overshadowed
 from magtensor.loop.searching.rounds import Ended, Rounds, with_lines
 from magtensor.loop.searching.strong_event import begun_with
@@ -81,6 +82,10 @@ def search(
             ended = _without_those_that_wander(ended, rounds)
     record, state, how, steps = ended.record, ended.state, ended.how, ended.steps
     shown = on_those_that_show(record, state, how, len(declared))
+    if shown is not state:  # of a law that came later the others may have hidden a part
+        places = range(len(declared), len(shown.adopted))
+        standing, gone = in_the_place_of_others(record, trial(record, shown, how), how, places)
+        shown, steps = standing.state, _with_dropped(steps, gone)
     last = ended.settled if shown is state else settled(record, shown, how)
     over = any(over_at_once(last, place) for place in range(len(declared), len(last.adopted)))
     if over or (state.fit.keep & ~last.fit.keep).any():  # what only these samples asked for goes with them
@@ -195,9 +200,12 @@ def _weighed_once_more(
     """A fit in which samples or models are missing that were there when the others were adopted, without those that no
     longer earn their place; and the rounds, which say so."""
     left, dropped = eliminate(record, state, how, fixed)
-    if not dropped:
-        return state, steps
-    return settled(record, left, how), (*steps[:-1], replace(steps[-1], dropped=(*steps[-1].dropped, *dropped)))
+    return (settled(record, left, how), _with_dropped(steps, dropped)) if dropped else (state, steps)
+
+
+def _with_dropped(steps: tuple[Step, ...], names: tuple[str, ...]) -> tuple[Step, ...]:
+    """The rounds, the last of which says that models were dropped."""
+    return (*steps[:-1], replace(steps[-1], dropped=(*steps[-1].dropped, *names))) if names else steps
 
 
 def _require_channels(x: Excitation, declared: Sequence[Adopted]) -> None:
