@@ -12,6 +12,7 @@ import pytest
 from loop_cases import Array, scenario, survey_file
 
 import magtensor
+from magtensor.errors import DataError
 from magtensor.loop.evidence.stretches import louder_in
 
 SEARCHED = ["offset_while", "offset_step", "temperature_offset"]
@@ -69,3 +70,12 @@ def test_of_a_stretch_that_is_doubted_most_is_louder_or_nothing() -> None:
     loud = rng.standard_normal((2000, 9))
     loud[700:800] *= 30.0
     assert louder_in(keep, [(9, loud)])[720:780].all()
+
+
+def test_what_is_wrong_throughout_is_not_said_to_lack_attitudes(tmp_path: Path) -> None:
+    path = survey_file(tmp_path, scenario(3, rate_Hz=0.5))
+    with h5py.File(path, "a") as file:
+        file["b_raw"][:, 2] *= np.array([1.0, -1.0, 1.0])
+    with pytest.raises(DataError, match="y axis of sensor 3 is inverted") as refused:
+        magtensor.close_loop(path, search=SEARCHED)
+    assert "attitudes" not in str(refused.value) and "nominal" not in str(refused.value)

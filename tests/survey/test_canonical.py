@@ -213,3 +213,14 @@ def test_a_checksummed_chunk_that_is_corrupt_is_named(tmp_path: Path) -> None:
     path.write_bytes(content)
     with pytest.raises(DataError, match=r"chunk\.h5: b_raw: the values cannot be read"):
         read_canonical(path)
+
+
+def test_times_of_too_few_digits_are_refused(tmp_path: Path) -> None:
+    """Seconds since 1970 as 32-bit numbers are 128 s apart; seconds of the survey are not."""
+    _, time, attributes = array_variables(60)["time"]
+    since_1970 = {**attributes, "units": "seconds since 1970-01-01T00:00:00Z"}
+    coarse = plain_file(tmp_path / "coarse.h5", time=(("time",), np.float32(time + 1.7e9), since_1970))
+    with pytest.raises(DataError, match=r"32-bit numbers near .* are 128 apart"):
+        read_canonical(coarse)
+    fine = plain_file(tmp_path / "fine.h5", time=(("time",), np.float32(time - time[0]), attributes))
+    assert len(read_canonical(fine).time) == 60

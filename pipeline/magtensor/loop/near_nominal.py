@@ -8,7 +8,7 @@ from dataclasses import replace
 from magtensor.calibration.nominal import Nominal
 from magtensor.calibration.types import ArrayCalibration
 from magtensor.calibration.undetermined import Undetermined, undetermined
-from magtensor.errors import DataError
+from magtensor.errors import DataError, NotEnoughData
 from magtensor.loop.fitting.model import Fitting
 from magtensor.loop.fitting.refit import require_determined
 from magtensor.loop.fitting.refit import settled as fitted_in_the_end
@@ -90,6 +90,8 @@ def begun(inquire: Inquire, how: Fitting, nominal: Nominal | None) -> Inquiry:
 def _refused(first: DataError, second: DataError) -> DataError:
     if second.what == first.what:  # what no prior helps against
         return second
+    if not isinstance(first, NotEnoughData):  # it was not for the attitudes
+        return first
     also = f"with sensors taken near nominal: {second.what}"
     hint = "; ".join(p for p in (first.hint, also, second.hint) if p)
     return type(first)(first.what, where=first.where or second.where, hint=hint)

@@ -15,7 +15,7 @@ from magtensor.errors import DataError
 from magtensor.survey.hdf5 import read_hdf5
 from magtensor.survey.model import AXES, Survey
 from magtensor.survey.tables import Column, Tables
-from magtensor.survey.times import numbers_to_seconds, since, split_since, to_epoch
+from magtensor.survey.times import numbers_to_seconds, require_digits, since, split_since, to_epoch
 from magtensor.units import UnitError, convert
 
 if TYPE_CHECKING:
@@ -130,6 +130,7 @@ def _time(column: Column, epoch: datetime | None = None) -> tuple[NDArray[np.flo
             raise ValueError(f"units '{column.units}' name no epoch" if column.units else "it has no units")
         values = column.load()
         _numeric(values, column)
+        require_digits(values, column.origin)
         seconds = numbers_to_seconds(values, parts[0])
     except ValueError as error:
         raise DataError(

@@ -19,6 +19,7 @@ from magtensor.survey.times import (
     UNIX,
     numbers_to_seconds,
     parse_instant,
+    require_digits,
     split_since,
     texts_to_seconds,
     to_epoch,
@@ -183,6 +184,7 @@ def _column_times(section: TimeSection, tables: Tables) -> tuple[NDArray[np.floa
                 texts = np.char.add(np.char.add(texts, " "), piece)
             return texts_to_seconds(texts, section.format, _epoch(section))
         values = matrix(tables, refs[0])[:, 0]
+        require_digits(values, where)
         units = section.units or columns[0].units or "s"
         parts = split_since(units)
         unit, epoch = parts if parts is not None else (units, _epoch(section))

@@ -8,6 +8,7 @@ from datetime import UTC, datetime, timedelta
 import numpy as np
 from numpy.typing import NDArray
 
+from magtensor.errors import DataError
 from magtensor.units import UnitError, convert
 
 UNIX = "1970-01-01T00:00:00Z"
@@ -83,6 +84,25 @@ def numbers_to_seconds(values: NDArray[np.generic], units: str) -> NDArray[np.fl
     return convert(values, units, "s")
 
 
+def require_digits(values: NDArray[np.generic], where: str) -> None:
+    """Refuse times (N,) that were stored with too few digits to tell one sample from the next.
+
+    Raises:
+        DataError: floating-point numbers most of which repeat, none nearer to the next than their last digit.
+    """
+    if values.dtype.kind != "f" or values.dtype.itemsize >= 8:
+        return
+    steps, largest = np.diff(values), np.max(np.abs(values), initial=0.0, where=np.isfinite(values))
+    if len(steps) and np.mean(steps == 0) > 0.5:
+        apart = float(np.spacing(largest))
+        raise DataError(
+            f"{8 * values.dtype.itemsize}-bit numbers near {largest:.4g} are {apart:g} apart: different samples have "
+            "the same time",
+            where=where,
+            hint="store times as 64-bit numbers, or count them from the start of the survey",
+        )
+
+
 def without_days(values: NDArray[np.generic], units: str, epoch: datetime) -> tuple[NDArray[np.generic], datetime]:
     """Whole numbers with the days up to the first moved into the epoch; other numbers as they are.
 
@@ -145,5 +165,6 @@ def texts_to_seconds(
 
 
 __all__ = [
-    "UNIX", "UnitError", "numbers_to_seconds", "parse_instant", "since", "split_since", "texts_to_seconds", "to_epoch",
+    "UNIX", "UnitError", "numbers_to_seconds", "parse_instant", "require_digits", "since", "split_since",
+    "texts_to_seconds", "to_epoch",
 ]  # fmt: skip

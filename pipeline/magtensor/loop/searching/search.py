@@ -83,8 +83,8 @@ def search(
     record, state, how, steps = ended.record, ended.state, ended.how, ended.steps
     shown = on_those_that_show(record, state, how, len(declared))
     if shown is not state:  # of a law that came later the others may have hidden a part
-        places = range(len(declared), len(shown.adopted))
-        standing, gone = in_the_place_of_others(record, trial(record, shown, how), how, places)
+        standing = trial(record, shown, how)
+        standing, gone = in_the_place_of_others(record, standing, how, range(len(declared), len(shown.adopted)))
         shown, steps = standing.state, _with_dropped(steps, gone)
     last = ended.settled if shown is state else settled(record, shown, how)
     over = any(over_at_once(last, place) for place in range(len(declared), len(last.adopted)))
