@@ -11,7 +11,8 @@ of this study; it is compared with that:
 
 - **right**: the effect is adopted, on the right sensors, under its name or as a response to its channel; **rival**: it
   is named as indistinguishable from what is adopted; **wrong**: something else is adopted in its place; **told**:
-  nothing is, but what is left looks like it, or is more than without it; **missed**: none of these.
+  nothing is, but what is left looks like it, or is more than without it; **missed**: none of these; **refused**: the
+  part with the effect in it has no calibration, and the run says why.
 - **beside it**: adopted, though neither put in nor adopted without it.
 - **off by**: the coefficients against those put in, as a share of these, where it is adopted under its own name.
 
@@ -275,14 +276,15 @@ def table(rows: list[dict[str, Any]]) -> str:
 
 def totals(rows: list[dict[str, Any]]) -> str:
     """How often each outcome came, amplitude by amplitude."""
-    made = [r for r in rows if r["effect"] and "refused" not in r]
-    head = ["size over the noise floor", "trials", *OUTCOMES, "something else beside it"]
+    made = [r for r in rows if r["effect"]]
+    head = ["size over the noise floor", "trials", *OUTCOMES, "refused", "something else beside it"]
     lines = [head, ["---"] * len(head)]
     for size in sorted({r["amplitude"] for r in made}):
         mine = [r for r in made if r["amplitude"] == size]
         counts: list[Callable[[dict[str, Any]], bool]] = [
-            *(lambda r, w=word: r["outcome"] == w for word in OUTCOMES),
-            lambda r: bool(r["beside"]),
+            *(lambda r, w=word: r.get("outcome") == w for word in OUTCOMES),
+            lambda r: "refused" in r,
+            lambda r: bool(r.get("beside")),
         ]
         lines.append([f"{size:g} x", str(len(mine)), *(str(sum(map(c, mine))) for c in counts)])
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
