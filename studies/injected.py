@@ -290,6 +290,12 @@ def totals(rows: list[dict[str, Any]]) -> str:
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
+def tables(rows: list[dict[str, Any]]) -> str:
+    """What the page says of the rows that there are."""
+    done = f"{sum(bool(r['effect']) for r in rows)} of {sum(bool(t.effect) for t in planned_trials())} trials so far."
+    return f"{done}\n\n{totals(rows)}\n\n{table(rows)}"
+
+
 def trial_of(row: dict[str, Any]) -> Trial:
     """The trial that a row is of."""
     return Trial(Part(*row["part"]), row["effect"], row["amplitude"])
@@ -300,9 +306,7 @@ def main() -> None:
         return [trial for trial in planned_trials() if only in trial.part.recipe]
 
     title = "An effect put into measured recordings"
-    trials.of_recordings(
-        title, __doc__, planned, trial_of, tried, words, lambda rows: f"{totals(rows)}\n\n{table(rows)}"
-    )
+    trials.of_recordings(title, __doc__, planned, trial_of, tried, words, tables)
 
 
 if __name__ == "__main__":

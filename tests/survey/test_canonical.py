@@ -216,11 +216,12 @@ def test_a_checksummed_chunk_that_is_corrupt_is_named(tmp_path: Path) -> None:
 
 
 def test_times_of_too_few_digits_are_refused(tmp_path: Path) -> None:
-    """Seconds since 1970 as 32-bit numbers are 128 s apart; seconds of the survey are not."""
+    """Seconds since 1970 as 32-bit numbers are 128 s apart; those of the survey are not, nor those of a slow clock."""
     _, time, attributes = array_variables(60)["time"]
     since_1970 = {**attributes, "units": "seconds since 1970-01-01T00:00:00Z"}
-    coarse = plain_file(tmp_path / "coarse.h5", time=(("time",), np.float32(time + 1.7e9), since_1970))
+    coarse = plain_file(tmp_path / "coarse.h5", time=(("time",), np.float32(100.0 * time + 1.7e9), since_1970))
     with pytest.raises(DataError, match=r"32-bit numbers near .* are 128 apart"):
         read_canonical(coarse)
-    fine = plain_file(tmp_path / "fine.h5", time=(("time",), np.float32(time - time[0]), attributes))
-    assert len(read_canonical(fine).time) == 60
+    for name, seconds in (("fine", time - time[0]), ("whole", np.floor(time - time[0]))):
+        file = plain_file(tmp_path / f"{name}.h5", time=(("time",), np.float32(seconds), attributes))
+        np.testing.assert_allclose(read_canonical(file).time, seconds, atol=1e-5)

@@ -88,13 +88,14 @@ def require_digits(values: NDArray[np.generic], where: str) -> None:
     """Refuse times (N,) that were stored with too few digits to tell one sample from the next.
 
     Raises:
-        DataError: floating-point numbers most of which repeat, none nearer to the next than their last digit.
+        DataError: floating-point numbers most of which repeat, and that differ by their last digit where they do not.
     """
     if values.dtype.kind != "f" or values.dtype.itemsize >= 8:
         return
     steps, largest = np.diff(values), np.max(np.abs(values), initial=0.0, where=np.isfinite(values))
-    if len(steps) and np.mean(steps == 0) > 0.5:
-        apart = float(np.spacing(largest))
+    apart, repeat = np.spacing(largest), steps == 0
+    # whole seconds repeat too, and say what the clock said
+    if np.count_nonzero(repeat) > 0.5 * len(steps) and np.min(np.abs(steps), initial=np.inf, where=~repeat) <= apart:
         raise DataError(
             f"{8 * values.dtype.itemsize}-bit numbers near {largest:.4g} are {apart:g} apart: different samples have "
             "the same time",
