@@ -7,8 +7,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from loop_cases import Array, synthetic
+from loop_cases import Array, linear_state, synthetic
 
+from magtensor.error_models.terms import Terms
+from magtensor.loop.evidence.assessment import WHITE, assess
+from magtensor.loop.evidence.gains import Gain
+from magtensor.loop.evidence.grams import Whitened
 from magtensor.loop.fitting.model import Adopted, Fitting, Record
 from magtensor.loop.fitting.refit import joint_state
 from magtensor.loop.fitting.trial import WORST_RISE, BlockErrors, Trial, trial
@@ -91,3 +95,45 @@ def test_only_blocks_that_are_not_known_with_and_without_are_left_out(
     """Errors of three blocks; the rest of the rule is that of the gate, a tenth."""
     found = judged(np.array(before), WITHIN).hurt_by(judged(np.array(after), WITHIN))
     assert found == (["S1"] if hurt else [])
+
+
+FROM_S, UNTIL_S = 620.0, 680.0  # half of the sixth of ten folds
+
+
+def beside_an_event(nT_on: float, *, everywhere: bool) -> Gain:
+    """What a heater of 0.6 nT gains beside an offset of one sensor for a minute, which one fold alone tells of."""
+    record = synthetic(4)
+    heater = np.sin(record.time / 19.0) > 0.0
+    on = (record.time >= FROM_S) & (record.time < UNTIL_S)
+    raw = record.raw.copy()
+    raw[:, 1] += np.outer(0.6 * heater + nT_on * on, [1.0, -0.5, 0.5])
+    logged = {"current_heater": heater.astype(float)}
+    channels: dict[str, Any] = {"units": {"current_heater": "A"}, "origins": {"current_heater": 0.0}}
+    state = linear_state(replace(record, raw=raw, logged=logged, **channels))
+
+    def terms_of(name: str, **settings: Any) -> Terms:
+        made: Terms = Registry.load().find("error_model", name).function(state.excitation, **settings)
+        return made.at(state.residual.samples)
+
+    event = terms_of("offset_while", time_s=FROM_S, until_s=UNTIL_S)
+    white = Whitened.of(state.residual, WHITE.across, WHITE.along, event)
+    return assess(white, terms_of("current_field"), everywhere=everywhere).gain
+
+
+def test_where_an_event_is_known_from_alone_is_no_judge_of_others() -> None:
+    """What the event does there, which the others leave, goes with the heater by chance: in one sense or the other."""
+    found, by_chance = (
+        [beside_an_event(sign * 100.0, everywhere=everywhere) for sign in (-1.0, 1.0)] for everywhere in (False, True)
+    )
+    for gain in found:
+        assert gain.judges is not None and gain.judges.tolist() == [0, 1, 2, 3, 4, 6, 7, 8, 9]
+        assert gain.consistent and not gain.contradicted
+    assert found[0].total == pytest.approx(found[1].total, rel=0.05)
+    assert min(gain.total for gain in by_chance) < 0.0 < max(gain.total for gain in by_chance)
+
+
+def test_gains_are_compared_on_the_folds_that_judged_both() -> None:
+    some = np.array([0, 1, 2, 4])
+    few, all_ = Gain(np.full(4, 9.0), np.full(4, 7.0), np.full(4, 50.0), some), Gain(*np.full((3, 5), 8.0))
+    assert few.over(all_).total == pytest.approx(4.0) and all_.over(few).total == pytest.approx(-4.0)
+    assert all_.over(all_).total == 0.0 and len(all_.over(all_).values) == 5

@@ -113,7 +113,9 @@ class Assessment:
     theta: Array
 
 
-def assess(now: Whitened, terms: Terms, *, once: bool = False, noise: OwnNoise | None = None) -> Assessment:
+def assess(
+    now: Whitened, terms: Terms, *, once: bool = False, noise: OwnNoise | None = None, everywhere: bool = False
+) -> Assessment:
     """Assess terms that no model holds yet, the coefficients of those that are in already being free as well.
 
     Two colours of noise are needed. A test of the null hypothesis uses the colour of the residual as it is: slow noise
@@ -130,6 +132,7 @@ def assess(now: Whitened, terms: Terms, *, once: bool = False, noise: OwnNoise |
     terms: with the residual's samples as rows.
     once: whether they are of something that happens once.
     noise: of the residual beside the given terms, where several terms are assessed in it.
+    everywhere: as in `held_out_gain`.
     """
     residual, given = now.residual, now.given
     together = terms if given is None else joined([given, terms])
@@ -137,8 +140,8 @@ def assess(now: Whitened, terms: Terms, *, once: bool = False, noise: OwnNoise |
     blocked = np.arange(together.count) < first
     parts = Blocks.of_an_event(terms) if once else Blocks.equal(len(residual.affine))
     null = grams_in(now, terms, parts.edges)
-    null_gain = held_out_gain(null, residual.freedom, blocked, parts)
-    null_focused = focused_gain(null, residual.freedom, blocked)
+    null_gain = held_out_gain(null, residual.freedom, blocked, parts, everywhere=everywhere)
+    null_focused = focused_gain(null, residual.freedom, blocked, everywhere=everywhere)
     best = likeliest(residual, together, [Colours(now.across, now.along, residual.scale), WHITE], _estimate(null).theta)
     colours = best.colours
     sensor = _only_sensor(null, first, terms)
@@ -148,8 +151,8 @@ def assess(now: Whitened, terms: Terms, *, once: bool = False, noise: OwnNoise |
     by_blocks = 0.0 if once else family_p(blocks, together.sensors, range(first, together.count))
     own_p = (noise or OwnNoise(residual, given)).p_value(terms) if by_blocks < BORNE_OUT else 1.0
     p = own_p if once else by_blocks
-    gain = held_out_gain(blocks, residual.freedom, blocked, parts)
-    focused = focused_gain(blocks, residual.freedom, blocked)
+    gain = held_out_gain(blocks, residual.freedom, blocked, parts, everywhere=everywhere)
+    focused = focused_gain(blocks, residual.freedom, blocked, everywhere=everywhere)
     left = left_there(residual, together, best.theta, first, parts)
     evidence = (parts, gain, null_gain, focused, null_focused, p, own_p, null_p, left)
     return Assessment(_estimate(blocks), *evidence, colours, best.theta)

@@ -19,6 +19,7 @@ LEAST_T = 2.0  # paired t of the held-out gain over folds
 LEAST_SHARE_OF_FOLDS = 0.8  # a strong slow effect gains unevenly, which keeps t low, but nearly everywhere
 WORSE = 4.0  # standard deviations below the mean of the folds, of the worst of ten
 CONCENTRATED = 0.9  # of what is known, in one fold: the others do not predict it
+MOST_FOLDS = 0.5  # that may be no judges
 
 
 @dataclass(frozen=True)
@@ -28,11 +29,13 @@ class Gain:
     Attributes:
         before, after: (folds,) sums of squared whitened residuals.
         values: how many values each fold holds.
+        judges: (folds,) the numbers of the folds, where not all of them judge.
     """
 
     before: Array
     after: Array
     values: Array
+    judges: NDArray[np.int_] | None = None
 
     @property
     def total(self) -> float:
@@ -47,8 +50,10 @@ class Gain:
         return float(each.mean() / (spread / np.sqrt(len(each)))) if spread > 0 else 0.0
 
     def over(self, other: Gain) -> Gain:
-        """What this gains over another on the same folds."""
-        return Gain(other.after, self.after, self.values)
+        """What this gains over another on the folds that both were judged on."""
+        mine, theirs = (np.arange(len(g.values)) if g.judges is None else g.judges for g in (self, other))
+        common, i, j = np.intersect1d(mine, theirs, return_indices=True)
+        return Gain(other.after[j], self.after[i], self.values[i], common)
 
     @property
     def consistent(self) -> bool:
@@ -72,9 +77,17 @@ class Gain:
 
 
 def held_out_gain(
-    g: Grams, freedom: int, blocked: NDArray[np.bool_] | None = None, blocks: Blocks | None = None
+    g: Grams,
+    freedom: int,
+    blocked: NDArray[np.bool_] | None = None,
+    blocks: Blocks | None = None,
+    *,
+    everywhere: bool = False,
 ) -> Gain:
     """Gain over contiguous folds, a block's gap between training and test.
+
+    A fold that holds nearly all that is known of a term of both models is no judge: there the others leave what that
+    term does, a passing vehicle say, and of two models the one that follows it by chance seems to do better.
 
     Parameters
     ----------
@@ -82,13 +95,14 @@ def held_out_gain(
     freedom: residual values a sample.
     blocked: (P,) terms that belong to both models compared.
     blocks: those of g and their folds; blocks and folds of equal length without.
+    everywhere: whether such folds judge all the same.
     """
     count = len(g.zz)
     edges = blocks.folds if blocks else np.linspace(0, count, min(FOLDS, count) + 1).round().astype(int)
-    return _gain_between(g, freedom, edges, blocked)
+    return _gain_between(g, freedom, edges, blocked, everywhere)
 
 
-def focused_gain(g: Grams, freedom: int, blocked: NDArray[np.bool_]) -> Gain | None:
+def focused_gain(g: Grams, freedom: int, blocked: NDArray[np.bool_], *, everywhere: bool = False) -> Gain | None:
     """The same over contiguous folds that know equally much of the terms; None where a few blocks know nearly all.
 
     What acts in one part of a survey only lies in one fold of equal length, and what the others predict of it is one
@@ -97,7 +111,7 @@ def focused_gain(g: Grams, freedom: int, blocked: NDArray[np.bool_]) -> Gain | N
     edges = focused_folds(g, blocked)
     if len(edges) <= LEAST_BLOCKS:
         return None
-    gain = _gain_between(g, freedom, edges, blocked)
+    gain = _gain_between(g, freedom, edges, blocked, everywhere)
     return replace(gain, values=np.full(len(gain.values), gain.values.mean()))  # each fold should gain as much
 
 
@@ -116,7 +130,13 @@ def concentrated(g: Grams, blocked: NDArray[np.bool_]) -> bool:
 
 
 def _share_of_blocks(g: Grams, chosen: NDArray[np.bool_]) -> Array:
-    """(B,) how much of what is known of some terms (P,) each block knows, constants left out; the sum is 1."""
+    """(B,) how much of what is known of some terms (P,) each block knows on average; the sum is 1."""
+    out: Array = _share_of_each(g, chosen).mean(axis=1)
+    return out
+
+
+def _share_of_each(g: Grams, chosen: NDArray[np.bool_]) -> Array:
+    """(B, p) the same of each of the terms, constants left out."""
     info = np.diagonal(g.aa, axis1=1, axis2=2)[:, g.own :].copy()
     pieces = g.pieces
     if len(pieces.term) and g.zz.any():
@@ -125,11 +145,13 @@ def _share_of_blocks(g: Grams, chosen: NDArray[np.bool_]) -> Array:
         size = np.diagonal(g.dd, axis1=1, axis2=2) - 2.0 * mean * mixed + mean**2 * own[:, None]
         np.add.at(info.T, pieces.term, (size[:, pieces.series] * pieces.alone).T)
     info = np.maximum(info[:, chosen], 0.0)
-    out: Array = (info / np.maximum(info.sum(axis=0), 1e-300)).mean(axis=1)
+    out: Array = info / np.maximum(info.sum(axis=0), 1e-300)
     return out
 
 
-def _gain_between(g: Grams, freedom: int, edges: NDArray[np.int_], blocked: NDArray[np.bool_] | None = None) -> Gain:
+def _gain_between(
+    g: Grams, freedom: int, edges: NDArray[np.int_], blocked: NDArray[np.bool_] | None, everywhere: bool
+) -> Gain:
     """Gain over folds of the finest blocks between edges."""
     count, folds = len(g.zz), len(edges) - 1
     test_masks, train_masks = np.zeros((folds, count), dtype=bool), np.ones((folds, count), dtype=bool)
@@ -138,7 +160,22 @@ def _gain_between(g: Grams, freedom: int, edges: NDArray[np.int_], blocked: NDAr
         test_masks[k, a:b] = True
         train_masks[k, max(a - gap, 0) : b + gap] = False
     every = np.ones(g.count, dtype=bool)
-    return gain_over(g, freedom, test_masks, train_masks, ~every if blocked is None else blocked, every)
+    before = ~every if blocked is None else blocked
+    judges = np.arange(folds) if everywhere else judged_by(g, train_masks, before)
+    gain = gain_over(g, freedom, test_masks[judges], train_masks[judges], before, every)
+    return gain if len(judges) == folds else replace(gain, judges=judges)
+
+
+def judged_by(g: Grams, train_masks: NDArray[np.bool_], given: NDArray[np.bool_]) -> NDArray[np.int_]:
+    """The numbers of the folds outside which (folds, B) something is known of each of the given terms (P,); all, where
+    these are too few."""
+    every = np.arange(len(train_masks))
+    if not given.any():
+        return every
+    share = _share_of_each(g, given)
+    known = train_masks @ share[:, share.any(axis=0)]
+    judges = np.flatnonzero((known >= 1.0 - CONCENTRATED).all(axis=1))
+    return judges if len(judges) > MOST_FOLDS * len(every) else every
 
 
 def interleaved_gain(g: Grams, freedom: int, before: NDArray[np.bool_], after: NDArray[np.bool_]) -> Gain:

@@ -199,11 +199,12 @@ def _refined(gain: Callable[[float], float], lags: Sequence[float]) -> float:
 
 
 def _seen_beside(alone: Terms, settled: Terms, few: tuple[Residual, Terms | None]) -> bool:
-    """Whether a response in equilibrium shows and predicts held-out blocks beside what dies away."""
+    """Whether a response in equilibrium shows and predicts held-out blocks beside what dies away, those in which that
+    does so among them."""
     residual, given = few
     beside = alone if given is None else joined([given, alone])
     colours = likeliest(residual, beside, [colours_of(residual), WHITE]).colours
-    found = assess(Whitened.of(residual, colours.across, colours.along, beside), settled)
+    found = assess(Whitened.of(residual, colours.across, colours.along, beside), settled, everywhere=True)
     return found.p < _ALONE and found.gain.consistent
 
 
