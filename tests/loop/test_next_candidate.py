@@ -147,7 +147,7 @@ def test_what_another_width_of_an_adopted_law_explains_is_no_other_effect(
     monkeypatch.setattr(rounds, "by_a_worse_log", lambda *_: set())
     monkeypatch.setattr(rounds, "part_of_a_larger_law", lambda *_: "")
     monkeypatch.setattr(rounds, "part_of_a_gradient", lambda *_: "")
-    monkeypatch.setattr(rounds, "part_of_a_drift", lambda *_: "")
+    monkeypatch.setattr(rounds, "part_of_a_drift", lambda *_: None)
     monkeypatch.setattr(rounds, "beside_time", lambda *_: BesideTime(True))
     monkeypatch.setattr(rounds, "part_of", lambda *_: False)
     monkeypatch.setattr(rounds, "overlaps", lambda c, failed, _: failed is width and c is creep)
@@ -182,7 +182,7 @@ def test_of_one_name_the_curve_of_another_channel_is_still_tried(monkeypatch: py
         "nearest": unchanged,
         "part_of_a_larger_law": lambda *_: "",
         "part_of_a_gradient": lambda *_: "",
-        "part_of_a_drift": lambda *_: "",
+        "part_of_a_drift": lambda *_: None,
         "rate_instead": lambda *_: "",
         "hindered_by_another": lambda *_: None,
         "as_predictive": lambda *_: set(),
@@ -214,11 +214,38 @@ def test_a_step_is_no_part_of_a_drift_unless_it_is(rises: Any, part: str) -> Non
     ]
     step, drift, _ = found
     assert max(step.assessment.gain.total, drift.assessment.gain.total) > 100.0
-    assert rivals.part_of_a_drift(step, found, state) == part
+
+    def whole_of(*candidates: Candidate) -> str:
+        lasting = rivals.part_of_a_drift(step, candidates, state)
+        assert lasting is None or lasting.of_an_event
+        return lasting.model.name if lasting else ""
+
+    assert whole_of(*found) == part
     assert not rivals.part_of_a_drift(drift, found, state)  # it lasts
     for null_p in (0.9 * ALPHA, 1.1 * ALPHA):
         doubtful = replace(unevenly(drift), adjusted_null_p=null_p)
-        assert rivals.part_of_a_drift(step, [step, doubtful], state) == (part if null_p < ALPHA else "")
+        assert whole_of(step, doubtful) == (part if null_p < ALPHA else "")
+
+
+def test_what_an_event_is_a_part_of_is_judged_where_that_was() -> None:
+    """A heater that ran twice, briefly: blocks hardly tell it from chance, but what happened once at one of the times
+    does, and the heater predicts that and the other."""
+    current = np.zeros(1200)
+    current[[*range(505, 535), *range(905, 925)]] = 1.0
+    added = 1.2 * current[:, None, None] * np.random.default_rng(2).standard_normal((4, 3))
+    record = replace(synthetic(9, added=added), logged={"current_heater": current - current.mean()})
+    record = replace(record, units={"current_heater": "A"}, origins={"current_heater": current.mean()})
+    state = linear_state(record)
+    event, heater = (
+        by_hand.candidate(Registry.load().find("error_model", name), {}, state, 30, ALPHA)
+        for name in ("offset_while", "current_field")
+    )
+    doubtful = replace(heater, adjusted_p=0.5, adjusted_own_p=0.5)
+    assert event.passes and not doubtful.passes
+    lasting = rivals.part_of_a_drift(event, [event, doubtful], state)
+    assert lasting is not None and lasting.model.name == "current_field"
+    assert lasting.passes and lasting.assessment.parts is event.assessment.parts
+    assert lasting.assessment.gain.total > event.assessment.gain.total
 
 
 def unevenly(drift: Candidate) -> Candidate:

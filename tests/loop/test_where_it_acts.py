@@ -16,6 +16,8 @@ from magtensor.loop.evidence.grams import grams
 from magtensor.loop.fitting.errors_before_after import folds_for
 from magtensor.loop.fitting.model import Adopted, Fitting, Record
 from magtensor.loop.fitting.refit import joint_state
+from magtensor.loop.fitting.trial import on_the_folds_of, trial
+from magtensor.loop.searching.contribution import eliminate, removal
 from magtensor.loop.searching.gates import ALPHA, SECOND_ORDER, Candidate
 from magtensor.loop.searching.outcome import why
 from magtensor.loop.searching.screening import candidates_of
@@ -99,6 +101,38 @@ def test_the_folds_of_the_third_gate_divide_what_happens_once() -> None:
     nearest = sorted(set(folds(passes)) - set(equal))
     assert len(nearest) == 4 and nearest[0] > 985 and nearest[-1] < 1015
     assert nearest[0] + nearest[-1] == pytest.approx(2000, abs=3)  # it is as long coming as it is going
+
+
+PULSE = slice(300, 420)  # within the second of five folds, over one edge of ten
+
+
+@pytest.mark.parametrize("on", [PULSE, slice(1132, SAMPLES), slice(0, 232)], ids=["once", "from late on", "at first"])
+def test_what_was_on_once_is_judged_on_folds_that_know_of_it(on: slice) -> None:
+    """The others know nothing but the noise of the log: what they make of it is no judgement of the effect."""
+    rng = np.random.default_rng(12)
+    current = np.zeros(SAMPLES)
+    current[on] = 1.5
+    vectors = rng.standard_normal((4, 3))
+    record = survey_with(13, current + 0.005 * rng.standard_normal(SAMPLES), current[:, None, None] * vectors)
+    adopted = [Adopted(model("current_field"), {"channel": "current_pump"})]
+    before, after = (trial(record, joint_state(record, models, Fitting()), Fitting()) for models in ([], adopted))
+    inner = set(after.folds.tolist()) - {0, 240, 480, 720, 960, 1200}
+    assert len(inner) == 4 and all(abs(edge - on.start) < 400 for edge in inner)
+    assert on_the_folds_of(after, record, before, Fitting()).hurt_by(after) == []
+    without, with_it = removal(after.state, 0)
+    assert with_it == pytest.approx(0.2, rel=0.05) and without > 1.5 * with_it
+    kept, dropped = eliminate(record, after.state, Fitting(), 0)
+    assert [a.name for a in kept.adopted] == ["current_field"] and dropped == ()
+
+
+def test_a_channel_seen_elsewhere_if_less_divides_no_fold() -> None:
+    """Two per cent of what is known is known from elsewhere: coefficients that err by seven times as much."""
+    current = np.zeros(SAMPLES)
+    current[PULSE] = 1.5
+    current[800:] += 0.12 * np.sign(np.sin(np.arange(400) / 9.0))
+    record = survey_with(14, current, np.zeros((SAMPLES, 4, 3)))
+    adopted = [Adopted(model("current_field"), {"channel": "current_pump"})]
+    assert folds_for(joint_state(record, adopted, Fitting())).tolist() == [0, 240, 480, 720, 960, 1200]
 
 
 @pytest.mark.long

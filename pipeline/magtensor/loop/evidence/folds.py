@@ -19,6 +19,7 @@ FINEST_BLOCKS = 120
 LEAST_PER_BLOCK = 4
 BLOCKS_OF_A_PART = 3  # the first and last of them are the gaps between training and test
 NEARLY_ALL = 0.95  # of what is known of an effect: by the others its coefficients err four times as much
+NOTHING = 0.01  # the same: by so little coefficients err ten times as much
 FEW = 3  # neighbouring folds: in more of them other folds may well confirm what happened
 
 

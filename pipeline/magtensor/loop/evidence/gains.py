@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from magtensor.calibration.types import Array
 from magtensor.loop.evidence.estimate import own_information, theta_of_each
-from magtensor.loop.evidence.folds import FOLDS, Blocks
+from magtensor.loop.evidence.folds import FOLDS, NOTHING, Blocks
 from magtensor.loop.evidence.grams import Grams, held_out, normal
 from magtensor.loop.evidence.statistics import LEAST_BLOCKS
 
@@ -106,12 +106,13 @@ def focused_gain(g: Grams, freedom: int, blocked: NDArray[np.bool_], *, everywhe
     """The same over contiguous folds that know equally much of the terms; None where a few blocks know nearly all.
 
     What acts in one part of a survey only lies in one fold of equal length, and what the others predict of it is one
-    figure.
+    figure. A fold outside which nothing is known of the terms, as all that there was before a current was switched on
+    for good, is no judge either.
     """
     edges = focused_folds(g, blocked)
     if len(edges) <= LEAST_BLOCKS:
         return None
-    gain = _gain_between(g, freedom, edges, blocked, everywhere)
+    gain = _gain_between(g, freedom, edges, blocked, everywhere, ~blocked)
     return replace(gain, values=np.full(len(gain.values), gain.values.mean()))  # each fold should gain as much
 
 
@@ -130,13 +131,7 @@ def concentrated(g: Grams, blocked: NDArray[np.bool_]) -> bool:
 
 
 def _share_of_blocks(g: Grams, chosen: NDArray[np.bool_]) -> Array:
-    """(B,) how much of what is known of some terms (P,) each block knows on average; the sum is 1."""
-    out: Array = _share_of_each(g, chosen).mean(axis=1)
-    return out
-
-
-def _share_of_each(g: Grams, chosen: NDArray[np.bool_]) -> Array:
-    """(B, p) the same of each of the terms, constants left out."""
+    """(B,) how much of what is known of some terms (P,) each block knows, constants left out; the sum is 1."""
     info = np.diagonal(g.aa, axis1=1, axis2=2)[:, g.own :].copy()
     pieces = g.pieces
     if len(pieces.term) and g.zz.any():
@@ -145,14 +140,20 @@ def _share_of_each(g: Grams, chosen: NDArray[np.bool_]) -> Array:
         size = np.diagonal(g.dd, axis1=1, axis2=2) - 2.0 * mean * mixed + mean**2 * own[:, None]
         np.add.at(info.T, pieces.term, (size[:, pieces.series] * pieces.alone).T)
     info = np.maximum(info[:, chosen], 0.0)
-    out: Array = info / np.maximum(info.sum(axis=0), 1e-300)
+    out: Array = (info / np.maximum(info.sum(axis=0), 1e-300)).mean(axis=1)
     return out
 
 
 def _gain_between(
-    g: Grams, freedom: int, edges: NDArray[np.int_], blocked: NDArray[np.bool_] | None, everywhere: bool
+    g: Grams,
+    freedom: int,
+    edges: NDArray[np.int_],
+    blocked: NDArray[np.bool_] | None,
+    everywhere: bool,
+    asked: NDArray[np.bool_] | None = None,
 ) -> Gain:
-    """Gain over folds of the finest blocks between edges."""
+    """Gain over folds of the finest blocks between edges, those that are judges beside the blocked terms and of those
+    `asked` (P,)."""
     count, folds = len(g.zz), len(edges) - 1
     test_masks, train_masks = np.zeros((folds, count), dtype=bool), np.ones((folds, count), dtype=bool)
     gap = 1 if count >= 4 * folds else 0
@@ -161,21 +162,28 @@ def _gain_between(
         train_masks[k, max(a - gap, 0) : b + gap] = False
     every = np.ones(g.count, dtype=bool)
     before = ~every if blocked is None else blocked
-    judges = np.arange(folds) if everywhere else judged_by(g, train_masks, before)
-    gain = gain_over(g, freedom, test_masks[judges], train_masks[judges], before, every)
-    return gain if len(judges) == folds else replace(gain, judges=judges)
+    gain, n = _gain_and_known(g, freedom, test_masks, train_masks, before, every)
+    if everywhere or not (before.any() or asked is not None):
+        return gain
+    judges = judged_by(n, normal(g.total())[0][0], before, asked)
+    return gain if len(judges) == folds else Gain(*(a[judges] for a in (gain.before, gain.after, gain.values)), judges)
 
 
-def judged_by(g: Grams, train_masks: NDArray[np.bool_], given: NDArray[np.bool_]) -> NDArray[np.int_]:
-    """The numbers of the folds outside which (folds, B) something is known of each of the given terms (P,); all, where
-    these are too few."""
-    every = np.arange(len(train_masks))
-    if not given.any():
-        return every
-    share = _share_of_each(g, given)
-    known = train_masks @ share[:, share.any(axis=0)]
-    judges = np.flatnonzero((known >= 1.0 - CONCENTRATED).all(axis=1))
-    return judges if len(judges) > MOST_FOLDS * len(every) else every
+def judged_by(
+    n: Array, every: Array, given: NDArray[np.bool_], asked: NDArray[np.bool_] | None = None
+) -> NDArray[np.int_]:
+    """The numbers of the folds outside which something is known of each of the given terms (P,), and of those `asked`
+    together; all, where these are too few.
+
+    Parameters
+    ----------
+    n: (folds, P, P) information outside each, the fit's own freedom projected off; every: (P, P) of all blocks.
+    """
+    known = np.diagonal(n, axis1=1, axis2=2) / np.maximum(np.diagonal(every), 1e-300)
+    judges = (known[:, given] >= 1.0 - CONCENTRATED).all(axis=1)
+    if asked is not None:
+        judges &= known[:, asked].mean(axis=1) >= NOTHING
+    return np.flatnonzero(judges if judges.sum() > MOST_FOLDS * len(judges) else np.ones_like(judges))
 
 
 def interleaved_gain(g: Grams, freedom: int, before: NDArray[np.bool_], after: NDArray[np.bool_]) -> Gain:
@@ -206,6 +214,18 @@ def gain_over(
     test_masks, train_masks: (folds, B) the blocks of each fold.
     before, after: (P,) terms of the two models compared.
     """
+    return _gain_and_known(g, freedom, test_masks, train_masks, before, after)[0]
+
+
+def _gain_and_known(
+    g: Grams,
+    freedom: int,
+    test_masks: NDArray[np.bool_],
+    train_masks: NDArray[np.bool_],
+    before: NDArray[np.bool_],
+    after: NDArray[np.bool_],
+) -> tuple[Gain, Array]:
+    """The same and the information (folds, P, P) on all terms outside each fold, the fit's own freedom projected off."""
     train, test = g.chosen(train_masks), g.chosen(test_masks)
     n, y = normal(train)
     own = own_information(g)
@@ -216,4 +236,4 @@ def gain_over(
             theta[:, use] = theta_of_each(n[:, use[:, None], use], y[:, use], own.of(use))
         return held_out(train, test, theta)[1]
 
-    return Gain(loss(before), loss(after), test.samples * freedom)
+    return Gain(loss(before), loss(after), test.samples * freedom), n

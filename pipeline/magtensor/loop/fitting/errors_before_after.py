@@ -14,7 +14,7 @@ from magtensor.calibration.joint import nearest_frame
 from magtensor.calibration.types import Array
 from magtensor.error_models.terms import Terms
 from magtensor.errors import DataError, NotEnoughData
-from magtensor.loop.evidence.folds import NEARLY_ALL, known_until
+from magtensor.loop.evidence.folds import NEARLY_ALL, NOTHING, known_until
 from magtensor.loop.fitting.model import Adopted, Fitting, Record, State
 from magtensor.loop.fitting.refit import joint_state, without
 from magtensor.sharing import shared_out
@@ -29,7 +29,8 @@ def folds_for(state: State) -> NDArray[np.int_]:
     Folds of equal length. Where two neighbours hold nearly all that can be known of a model, they are divided into as
     many that know equally much: one part of a vehicle's passing is predicted by its other parts, and by nothing else.
     So is one without which hardly anything is known of a model that follows no channel, as the beginning of a warming
-    up that is soon over; a channel's course is seen elsewhere too, if less.
+    up that is soon over. A channel's course is seen elsewhere too, if less; but of a pump that ran once the other folds
+    know nothing.
     What is known follows from the regressors; their settings, as everywhere in these folds, were found on all samples.
     """
     n = len(state.excitation.time)
@@ -42,7 +43,7 @@ def folds_for(state: State) -> NDArray[np.int_]:
         left = _known_without_each(terms, edges)
         if held.max() > NEARLY_ALL:
             first, last = edges[held.argmax()], edges[held.argmax() + 2]
-        elif left.min() < 1.0 - NEARLY_ALL and not model.channels(state.excitation):
+        elif left.min() < (NOTHING if model.channels(state.excitation) else 1.0 - NEARLY_ALL):
             first, last = edges[left.argmin()], edges[left.argmin() + 1]
         else:
             continue

@@ -68,7 +68,8 @@ def _blocks(state: State, colours: Colours | None = None, parts: Blocks | None =
 
 
 def _gain_of(state: State, place: int, blocks: Grams, colours: Colours | None = None) -> Gain:
-    """What one of the adopted models gains on held-out folds beside the others: of what happened once, on its parts.
+    """What one of the adopted models gains on held-out folds beside the others: of what happened once, on its parts; of
+    what lies in one fold, as a warming up that is soon over, on folds that know equally much, where there are any.
 
     Parameters
     ----------
@@ -77,7 +78,8 @@ def _gain_of(state: State, place: int, blocks: Grams, colours: Colours | None = 
     assert state.terms is not None
     others, freedom = _all_but(state, [place]), state.residual.freedom
     if not happens_once(state.adopted[place]):
-        return held_out_gain(blocks, freedom, others)
+        focused = focused_gain(blocks, freedom, others) if concentrated(blocks, others) else None
+        return focused or held_out_gain(blocks, freedom, others)
     parts = Blocks.of_an_event(state.terms.only(np.flatnonzero(~others).tolist()))
     return held_out_gain(_blocks(state, colours, parts), freedom, others, parts)
 
@@ -234,15 +236,13 @@ def _rise(state: State, place: int) -> float:
     """The factor by which an adopted model raises the error on held-out blocks, over what it may.
 
     What lasts has to lower it. Of what happened once the blocks where it did say little, and what holds a waveform has
-    its noise: both may raise it somewhat. Of what lies in one fold, as a warming up that is soon over, the folds that
-    know equally much are asked, and where only a few blocks know anything it is as if it had happened once.
+    its noise: both may raise it somewhat. Where only a few blocks know anything it is as if it had happened once.
     """
     others, lasting = _all_but(state, [place]), _lasts(state.adopted[place])
     blocks = _blocks(state, WHITE)
     gain = _gain_of(state, place, blocks, WHITE)
     if lasting and concentrated(blocks, others):
-        focused = focused_gain(blocks, state.residual.freedom, others)
-        gain, lasting = focused or gain, focused is not None
+        lasting = focused_gain(blocks, state.residual.freedom, others) is not None
     before, after = gain.rms
     return after / before / (1.0 - LEAST_FALL if lasting else 1.0 + WORST_RISE)
 

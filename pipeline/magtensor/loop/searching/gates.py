@@ -46,6 +46,7 @@ class Candidate:
         before: what it was judged against, where that is the fit with it, its part put back (`own_fit`).
         moved: the place of an adopted model that takes other settings beside it, and that model with these (`split`);
             `terms` are of both then, the one that takes other settings first.
+        of_an_event: whether something that happened once, which passes, is a part of what it explains: it lasts.
     """
 
     model: Adopted
@@ -61,6 +62,7 @@ class Candidate:
     kin: float = 0.0
     before: State | None = None
     moved: tuple[int, Adopted] | None = None
+    of_an_event: bool = False
 
     def among(self, models: int) -> Candidate:
         """The same, found among so many models rather than by itself."""
@@ -111,9 +113,10 @@ class Candidate:
         sensor's own spectrum, if the blocks bear it out: as a test of this model alone where it is added to the axes,
         among all models where it turns with the field, for noise that turns with it (a mount that creeps) has no
         spectrum. The p value of what happens once is not from blocks, and of a tone that spectrum does not know that
-        its strongest line was taken.
+        its strongest line was taken. Nor do blocks tell much of what switched once or twice: an event that noise does
+        not explain, and that is a part of it, says that there is something.
         """
-        if self.adjusted_p < self.alpha:
+        if self.adjusted_p < self.alpha or self.of_an_event:
             return True
         if not self._of_a_known_spectrum:
             return False
@@ -184,7 +187,8 @@ class Candidate:
         if focused is None or null is None or self.assessment.gain.total <= 0:
             return False
         channel = any(isinstance(grid, AnyChannel) for grid in profiled(self.model.component).values())
-        unlikely = self.adjusted_p < self.alpha and self.adjusted_null_p < self.alpha
+        by_blocks = self.adjusted_p < self.alpha or self.of_an_event
+        unlikely = by_blocks and self.adjusted_null_p < self.alpha
         if not (unlikely and (channel or happens_once(self.model))) and not self.beyond_own_noise:
             return False
         return focused.consistent and not focused.contradicted and null.total > 0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 from magtensor.error_models.excitation import Excitation
 from magtensor.error_models.settings import AnyChannel, Duration, EventTimes, Range, profiled
@@ -130,16 +131,16 @@ def overlaps(candidate: Candidate, other: Candidate, state: State) -> bool:
     return both - whole < SMALL_PART * own
 
 
-def part_of_a_drift(candidate: Candidate, candidates: Sequence[Candidate], state: State) -> str:
-    """The name of a model of what lasts that predicts as much as a candidate of what happened once, and leaves it
-    next to nothing; "" where there is none.
+def part_of_a_drift(candidate: Candidate, candidates: Sequence[Candidate], state: State) -> Candidate | None:
+    """A model of what lasts that predicts as much as a candidate of what happened once, and leaves it next to nothing;
+    None where there is none.
 
     A drift is judged by the scatter of long blocks, which tells little of it, and something that happened once is not.
     Where a drift predicts more on blocks that neither has seen, the event is the place where it is steepest. So a drift
     that predicts unevenly counts as well, if slow noise does not explain it.
     """
     if not happens_once(candidate.model):
-        return ""
+        return None
     for other in candidates:
         gain = other.assessment.gain
         if happens_once(other.model) or generic(other.model):
@@ -148,8 +149,15 @@ def part_of_a_drift(candidate: Candidate, candidates: Sequence[Candidate], state
             continue
         whole, own, both = _beside(candidate, other, state)
         if own <= whole and both - whole < SMALL_PART * own:
-            return other.model.name
-    return ""
+            return _judged_by_its_part(other, candidate, state)
+    return None
+
+
+def _judged_by_its_part(lasting: Candidate, event: Candidate, state: State) -> Candidate:
+    """What lasts, as it stands beside an event that passes and is a part of it: judged on the event's own folds."""
+    found, parts, before = lasting.assessment, event.assessment.parts, lasting.before or state
+    gain, null_gain = (fold_gain(before, c, lasting.terms, parts=parts) for c in (found.colours, before.colours))
+    return replace(lasting, of_an_event=True, assessment=replace(found, parts=parts, gain=gain, null_gain=null_gain))
 
 
 def _beside(candidate: Candidate, other: Candidate, state: State) -> tuple[float, float, float]:

@@ -213,7 +213,11 @@ class Rounds:
             best = containing(best, possible, before.state)
             chosen, rivals = simplest(best, possible, before.state)
             lawful = [c for c in candidates if refused.get(c.model.name) != NOT_AS_ASSUMED]
-            if why := self.of_another(chosen, lawful, before.state):
+            if lasting := part_of_a_drift(chosen, lawful, before.state):
+                refuse(chosen.model.name, AS_LASTING.format(lasting.model.name))
+                left[:] = [lasting if c.model.name == lasting.model.name else c for c in left]
+                continue
+            if why := self.of_another(chosen, before.state):
                 refuse(chosen.model.name, why)
                 continue
             chosen, channels = nearest(chosen, before.state, models, anything)
@@ -274,10 +278,8 @@ class Rounds:
             last = on_those_needed(record, last, len(last.adopted) - 1, how)
         return replace(tried, after=trial(record, last, how)), dropped
 
-    def of_another(self, chosen: Candidate, candidates: Sequence[Candidate], state: State) -> str:
+    def of_another(self, chosen: Candidate, state: State) -> str:
         """Why a candidate, before it is fitted, is taken for a part of what another model explains; "" if it is not."""
-        if name := part_of_a_drift(chosen, candidates, state):
-            return AS_LASTING.format(name)
         if name := rate_instead(chosen, state, self.models):
             return f"{name}, for which the field turns too fast between samples, explains more"
         return part_of_a_larger_law(chosen, state) or part_of_a_gradient(chosen, state)
@@ -294,7 +296,9 @@ class Rounds:
         """One of the candidates that does not predict by itself, if it passes both gates beside what is found when it
         is in, and would not be refused as one that passes."""
         state = before.state
-        if self.of_another(chosen, candidates, state) or beside_time(chosen, state).refused:
+        if part_of_a_drift(chosen, candidates, state) or self.of_another(chosen, state):
+            return None
+        if beside_time(chosen, state).refused:
             return None
         two = self.with_another(record, before, chosen, fitted_everywhere(record, before, chosen, how), how)
         if two is None or two.standing is None:
