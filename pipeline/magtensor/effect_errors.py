@@ -220,7 +220,8 @@ def taken_off(
     sensors = len(fitted.matrix)
     record = record_of(survey, origins=origins, every=True)
     linear = as_fitted(calibration, fitted)
-    b = filled(linear.apply(np.asarray(clean.values("b_raw"), dtype=float)), clean.readings)
+    b = linear.apply(np.asarray(clean.values("b_raw"), dtype=float))
+    b = filled(record.believed(b), clean.readings)
     raw = by_sensor(np.asarray(np.linalg.inv(linear.matrix), dtype=float), b) + linear.offset
     x = record.excitation(raw, b)
     terms = joined([model.terms(x) for model, _ in applied])

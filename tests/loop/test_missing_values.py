@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -18,9 +19,11 @@ from magtensor.loop.correcting.filled import filled
 from magtensor.preparing import empty_survey
 from magtensor.recipe.plan import read_plan
 from magtensor.runner import run
+from magtensor.survey.model import Survey
 from magtensor.verdict import verdict
 
 SILENT = slice(1000, 1200)  # samples, of the third sensor
+OTHERS = [0, 1, 3]
 NOISE_NT = 0.15  # of each output of the simulator's surveys
 
 N = 900
@@ -132,31 +135,47 @@ def test_the_state_that_a_response_began_with_is_sought_in_such_a_field() -> Non
     np.testing.assert_allclose(Here.of(record, calibration).excitation.field, raw, atol=1e-6)
 
 
-@pytest.mark.parametrize(
-    "effect",
-    [
-        {"type": "averaging", "spread_s2": [0.15**2 / 12.0] * 4},
-        {"type": "eddy_current", "rms_nT": 20.0},
-    ],
-    ids=lambda effect: str(effect["type"]),
-)
-def test_nothing_is_spoiled_beside_a_gap(tmp_path: Path, effect: dict[str, object]) -> None:
-    """What is taken off before and after a gap of one sensor is what is taken off where there is none."""
+def applied_with_and_without(tmp_path: Path, effect: dict[str, Any], silence: float) -> tuple[Survey, Survey]:
+    """A calibration that knows an effect applied to another survey, as it is and with one sensor silent for a while."""
     surveys = [survey_file(tmp_path, scenario(seed, effect), f"{seed}.h5") for seed in (52, 53)]
     silent = tmp_path / "silent.h5"
     shutil.copy(surveys[1], silent)
     with h5py.File(silent, "a") as file:
-        file["b_raw"][SILENT, 2] = np.nan
+        file["b_raw"][SILENT, 2] = silence
     plan = read_plan(RECIPE, survey=surveys[0], overrides=[f"stages.close_loop.search=[{effect['type']}]"])
     made = run(plan, empty_survey(plan)).survey
     assert [a["error_model"] for a in verdict(made)["adopted"]] == [effect["type"]]
     whole, lost = (
         apply_and_refine(made, path, plan, tolerant=True, refine_rotation=False)[0] for path in (surveys[1], silent)
     )
+    assert not lost.good_by_sensor[SILENT, 2].any() and lost.good_by_sensor[SILENT][:, OTHERS].mean() > 0.99
+    return whole, lost
+
+
+@pytest.mark.parametrize(
+    ("effect", "silence"),
+    [
+        ({"type": "averaging", "spread_s2": [0.15**2 / 12.0] * 4}, np.nan),
+        ({"type": "eddy_current", "rms_nT": 20.0}, np.nan),
+        ({"type": "eddy_current", "rms_nT": 20.0}, 0.0),
+    ],
+    ids=["averaging", "eddy current", "eddy current, zeros"],
+)
+def test_nothing_is_spoiled_beside_a_gap(tmp_path: Path, effect: dict[str, Any], silence: float) -> None:
+    """What is taken off before and after a gap of one sensor is what is taken off where there is none."""
+    whole, lost = applied_with_and_without(tmp_path, effect, silence)
     moved = np.abs(lost.values("calibrated/b") - whole.values("calibrated/b"))
-    assert np.isnan(moved[SILENT, 2]).all()
     beside = np.delete(moved, np.r_[SILENT], axis=0)
     assert np.isfinite(beside).all() and beside.max() < 0.1 * NOISE_NT
-    assert moved[SILENT][:, [0, 1, 3]].max() < 0.1 * NOISE_NT  # the others, meanwhile
+    assert moved[SILENT][:, OTHERS].max() < 0.1 * NOISE_NT
     known = (np.delete(s.values("calibrated/tensor_std"), np.r_[SILENT], axis=0) for s in (lost, whole))
     np.testing.assert_allclose(*known, rtol=1e-4)
+
+
+@pytest.mark.parametrize("silence", [np.nan, 0.0])
+def test_the_others_are_brought_back_to_their_time_meanwhile(tmp_path: Path, silence: float) -> None:
+    whole, lost = applied_with_and_without(tmp_path, {"type": "sampling_lag", "rms_nT": 30.0}, silence)
+    moved = np.abs(lost.values("calibrated/b") - whole.values("calibrated/b"))
+    assert moved[:, OTHERS].max() < 0.1 * NOISE_NT
+    far = np.delete(moved[:, 2], np.r_[SILENT.start - 6 : SILENT.stop + 6], axis=0)  # from where a spline forgets it
+    assert far.max() < NOISE_NT

@@ -190,7 +190,7 @@ class Here:
     @classmethod
     def of(cls, record: Record, calibration: ArrayCalibration, good: NDArray[np.bool_] | None = None) -> Here:
         contrast = _Contrast.of(record, calibration, good)
-        b = filled(calibration.apply(record.raw), contrast.usable)
+        b = filled(record.believed(calibration.apply(record.raw)), contrast.usable)
         b = over_disturbances(b, contrast.usable, record.time, record.run)
         forward = np.asarray(np.linalg.inv(calibration.matrix), dtype=float)
         x = record.excitation(by_sensor(forward, b) + calibration.offset, b, matrix=forward)

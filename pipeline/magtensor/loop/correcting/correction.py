@@ -65,7 +65,7 @@ def corrected_raw(
     forward = np.linalg.inv(calibration.matrix)
 
     def terms_for(raw: Array, models: Sequence[Adopted]) -> list[Terms]:
-        b = filled(calibration.apply(raw), good)
+        b = filled(record.believed(calibration.apply(raw)), good)
         if good is not None:
             b = over_disturbances(b, good, record.time, record.run)
         x = record.excitation(by_sensor(forward, b) + calibration.offset, b, matrix=np.asarray(forward, dtype=float))
@@ -100,7 +100,11 @@ def _on_time(record: Record, each: Sequence[Terms], theta: Sequence[Array], good
     late = lateness(each, theta, record.raw[0].size)
     if late is None:
         return record.raw
-    flat = on_time(record.raw.reshape(len(record.raw), -1), record.time, record.run, late, good)
+    trusted = good
+    if good is not None and record.readings is not None:  # one that is silent makes no other one late
+        own = record.readings & ~record.readings.all(axis=1, keepdims=True)
+        trusted = np.repeat(good[:, None] | own, 3, axis=1)
+    flat = on_time(record.raw.reshape(len(record.raw), -1), record.time, record.run, late, trusted)
     return np.where(unseen(record.time, record.run, late), np.nan, flat).reshape(record.raw.shape)
 
 

@@ -111,7 +111,7 @@ class _Lengths:
     @classmethod
     def of(cls, record: Record, calibration: ArrayCalibration, total_field: Array, good: NDArray[np.bool_]) -> _Lengths:
         usable = np.asarray(np.isfinite(record.raw).all(axis=(1, 2)))
-        b = filled(calibration.apply(record.raw), good)
+        b = filled(record.believed(calibration.apply(record.raw)), good)
         forward = np.asarray(np.linalg.inv(calibration.matrix), dtype=float)
         x = record.excitation(by_sensor(forward, b) + calibration.offset, b, matrix=forward)
         use = np.flatnonzero(usable & good & np.isfinite(total_field))
