@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from magtensor.calibrated import MATRIX_ENTRIES, OFFSET_ENTRIES
+from magtensor.calibration.by_sensor import by_sensor
 from magtensor.calibration.common_field import CommonField
 from magtensor.calibration.common_scale import nominal
 from magtensor.calibration.joint import calibrated, nearest_frame
@@ -26,6 +27,7 @@ from magtensor.calibration.types import Array, ArrayCalibration
 from magtensor.error_models.terms import REFERENCE, Terms, joined
 from magtensor.error_models.waveform import NAME as HIDDEN
 from magtensor.loop.correcting.another_survey import TONE
+from magtensor.loop.correcting.filled import filled
 from magtensor.loop.evidence.columns import across_directions, along_the_field
 from magtensor.loop.evidence.residual import Residual
 from magtensor.loop.fitting.model import Adopted, State
@@ -217,9 +219,11 @@ def taken_off(
         return None
     sensors = len(fitted.matrix)
     record = record_of(survey, origins=origins, every=True)
-    raw = np.asarray(clean.values("b_raw"), dtype=float)
-    raw = np.where(np.isfinite(raw), raw, np.nanmean(raw, axis=0))  # a lost sample must not spoil its neighbours
-    x = record.excitation(raw, as_fitted(calibration, fitted).apply(raw))
+    linear = as_fitted(calibration, fitted)
+    b = linear.apply(np.asarray(clean.values("b_raw"), dtype=float))
+    b = filled(record.believed(b), clean.readings)
+    raw = by_sensor(np.asarray(np.linalg.inv(linear.matrix), dtype=float), b) + linear.offset
+    x = record.excitation(raw, b)
     terms = joined([model.terms(x) for model, _ in applied])
     response = np.zeros((terms.series.shape[1], 3 * sensors, terms.count))
     use = terms.part_output != REFERENCE

@@ -60,6 +60,9 @@ def test_bad_samples_stay_and_spoil_no_others() -> None:
     rest = trusted & (np.arange(200) != 120)
     np.testing.assert_allclose(found[rest], np.sin(time + 0.03)[rest, None], atol=1e-6)
     assert found[70] == 1e5 and np.isnan(found[120])
+    both = on_time(np.hstack([spoiled, clean]), time, run, late_by.repeat(2, axis=1), np.c_[trusted, trusted | True])
+    np.testing.assert_array_equal(both[:, :1], found)
+    np.testing.assert_allclose(both[:, 1], np.sin(time + 0.03), atol=1e-6)  # another output is there all the time
 
 
 @pytest.mark.long

@@ -53,13 +53,13 @@ def on_time(
     """Columns (N, K) that are late by (N, K) s as they would be on time: what is stamped t belongs to t - late.
 
     Each run by itself, by a spline of the fifth degree through its samples. Half a sample beyond its ends nobody has
-    seen the outputs: there they follow their slope. A sample that is not trusted, or missing, stays as it is, and the
-    others are not interpolated from it.
+    seen the outputs: there they follow their slope. A sample (N,), or a value (N, K) of one, that is not trusted, or
+    missing, stays as it is, and the others are not interpolated from it.
     """
     out = columns.copy()
     usable = np.isfinite(columns)
     if trusted is not None:
-        usable &= trusted[:, None]
+        usable &= trusted.reshape(len(trusted), -1)
     for a, b in contiguous(run):
         for k in np.flatnonzero(late[a:b].any(axis=0)):
             own = np.flatnonzero(usable[a:b, k]) + a

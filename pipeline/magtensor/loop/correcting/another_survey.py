@@ -16,6 +16,7 @@ from magtensor.calibration.by_sensor import by_sensor
 from magtensor.calibration.types import Array, ArrayCalibration
 from magtensor.error_models.excitation import Excitation
 from magtensor.error_models.settings import Beginning, profiled
+from magtensor.loop.correcting.filled import filled
 from magtensor.loop.fitting.model import Adopted, Record
 from magtensor.loop.fitting.seen import over_disturbances
 from magtensor.tensor.geometry import array_design
@@ -189,7 +190,8 @@ class Here:
     @classmethod
     def of(cls, record: Record, calibration: ArrayCalibration, good: NDArray[np.bool_] | None = None) -> Here:
         contrast = _Contrast.of(record, calibration, good)
-        b = over_disturbances(calibration.apply(np.nan_to_num(record.raw)), contrast.usable, record.time, record.run)
+        b = filled(record.believed(calibration.apply(record.raw)), contrast.usable)
+        b = over_disturbances(b, contrast.usable, record.time, record.run)
         forward = np.asarray(np.linalg.inv(calibration.matrix), dtype=float)
         x = record.excitation(by_sensor(forward, b) + calibration.offset, b, matrix=forward)
         return cls(record, calibration, contrast, x)

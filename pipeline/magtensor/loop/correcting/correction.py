@@ -15,6 +15,7 @@ from magtensor.error_models.terms import Terms
 from magtensor.error_models.waveform import NAME, bends, course_of, too_little_shows
 from magtensor.errors import DataError
 from magtensor.loop.correcting.another_survey import as_begun_here
+from magtensor.loop.correcting.filled import filled
 from magtensor.loop.fitting.model import Adopted, Record, State
 from magtensor.loop.fitting.refit import without
 from magtensor.loop.fitting.seen import over_disturbances
@@ -64,7 +65,7 @@ def corrected_raw(
     forward = np.linalg.inv(calibration.matrix)
 
     def terms_for(raw: Array, models: Sequence[Adopted]) -> list[Terms]:
-        b = _whole(calibration.apply(raw))
+        b = filled(record.believed(calibration.apply(raw)), good)
         if good is not None:
             b = over_disturbances(b, good, record.time, record.run)
         x = record.excitation(by_sensor(forward, b) + calibration.offset, b, matrix=np.asarray(forward, dtype=float))
@@ -99,7 +100,11 @@ def _on_time(record: Record, each: Sequence[Terms], theta: Sequence[Array], good
     late = lateness(each, theta, record.raw[0].size)
     if late is None:
         return record.raw
-    flat = on_time(record.raw.reshape(len(record.raw), -1), record.time, record.run, late, good)
+    trusted = good
+    if good is not None and record.readings is not None:  # one that is silent makes no other one late
+        own = record.readings & ~record.readings.all(axis=1, keepdims=True)
+        trusted = np.repeat(good[:, None] | own, 3, axis=1)
+    flat = on_time(record.raw.reshape(len(record.raw), -1), record.time, record.run, late, trusted)
     return np.where(unseen(record.time, record.run, late), np.nan, flat).reshape(record.raw.shape)
 
 
@@ -199,17 +204,3 @@ def corrected_reference(record: Record, adopted: Sequence[Adopted], theta: Seque
             terms = model.terms(record.excitation(placeholder, placeholder))
             field = field - terms.on_reference(coefficients)
     return field
-
-
-def _whole(values: Array) -> Array:
-    """Missing values filled from the neighbours, so that one lost sample does not spoil a filter."""
-    flat = values.reshape(len(values), -1)
-    bad = ~np.isfinite(flat)
-    if not bad.any():
-        return values
-    flat = flat.copy()
-    index = np.arange(len(flat))
-    for j in np.flatnonzero(bad.any(axis=0)):
-        good = ~bad[:, j]
-        flat[:, j] = np.interp(index, index[good], flat[good, j]) if good.any() else 0.0
-    return flat.reshape(values.shape)

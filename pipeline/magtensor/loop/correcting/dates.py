@@ -18,6 +18,7 @@ from magtensor.calibration.types import Array, ArrayCalibration
 from magtensor.error_models.excitation import Excitation
 from magtensor.error_models.settings import Duration, EventTimes, profiled
 from magtensor.loop.correcting.another_survey import Here, seen_in, shows_a_state
+from magtensor.loop.correcting.filled import filled
 from magtensor.loop.fitting.model import Adopted, Record
 
 ANEW = 0.5  # of the difference between another start and the known one
@@ -110,7 +111,7 @@ class _Lengths:
     @classmethod
     def of(cls, record: Record, calibration: ArrayCalibration, total_field: Array, good: NDArray[np.bool_]) -> _Lengths:
         usable = np.asarray(np.isfinite(record.raw).all(axis=(1, 2)))
-        b = calibration.apply(np.where(usable[:, None, None], record.raw, 0.0))
+        b = filled(record.believed(calibration.apply(record.raw)), good)
         forward = np.asarray(np.linalg.inv(calibration.matrix), dtype=float)
         x = record.excitation(by_sensor(forward, b) + calibration.offset, b, matrix=forward)
         use = np.flatnonzero(usable & good & np.isfinite(total_field))

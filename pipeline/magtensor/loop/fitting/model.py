@@ -41,6 +41,7 @@ class Record:
         station: the base station's own readings without their noise; None where only `total_field` is known.
         courses: of its thermometers, as in Excitation.
         absent: names of channels that are missing too often to be searched.
+        readings: (N, S) which sensor's sample may be used and is a reading; None where all are.
     """
 
     time: Array
@@ -61,6 +62,7 @@ class Record:
     station: Station | None = None
     courses: dict[str, tuple[Array, Array]] = field(default_factory=dict, compare=False, repr=False)
     absent: tuple[str, ...] = ()
+    readings: NDArray[np.bool_] | None = None
 
     def at(self, keep: NDArray[np.int_]) -> Record:
         """Some of the samples."""
@@ -77,7 +79,15 @@ class Record:
             samples=self.samples[keep],
             waveform=None if self.waveform is None else self.waveform[keep],
             courses={},
+            readings=None if self.readings is None else self.readings[keep],
         )
+
+    def believed(self, values: Array) -> Array:
+        """Values (N, S, 3), missing for a sensor that gives no reading while another one does."""
+        if self.readings is None or self.readings.all():
+            return values
+        silent = ~self.readings & self.readings.any(axis=1, keepdims=True)
+        return np.where(silent[..., None], np.nan, values)
 
     def excitation(
         self,

@@ -97,6 +97,7 @@ def record_of(
         attitude=attitude,
         samples=np.arange(len(time)),
         absent=tuple(absent),
+        readings=survey.readings_by_sensor if every else None,
     )
     return whole if len(keep) == len(time) else whole.at(keep)
 
