@@ -21,6 +21,7 @@ from magtensor.loop.evidence.stretches import ABOUT, LEAST_LOUD
 from magtensor.loop.fitting.model import Fitting, Record, State
 from magtensor.loop.fitting.refit import disturbed, without
 from magtensor.loop.remainder.changing_matrix import changing_matrices
+from magtensor.loop.remainder.excess import excess_rms
 from magtensor.loop.remainder.flagged import (
     ALIKE,
     after_pauses,
@@ -244,11 +245,6 @@ def growing_words(name: str, steps: Array, elapsed: Array) -> list[str]:
     times = float(np.sqrt(loudness[loud] / loudness[quiet]))
     here, there = (f"from {elapsed[edges[k]]:.5g} to {elapsed[edges[k + 1]]:.5g} s" for k in (loud, quiet))
     return [f"the noise of {name} is {times:.2g} times as loud {here} as {there}"]
-
-
-def excess_rms(state: State) -> float:
-    """nT rms of the residual above the white noise."""
-    return float(np.sqrt(max(state.residual.square() - 1.0, 0.0)) * state.residual.scale)
 
 
 def strongest_line(state: State, record: Record) -> tuple[float, float] | None:
