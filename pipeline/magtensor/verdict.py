@@ -108,8 +108,8 @@ def sentence(outcome: dict[str, Any]) -> str:
         head = f"Calibrated with {model}; a residual remains that no known effect explains"
     else:
         head = f"Calibrated with {model}; nothing is left that asks for another effect"
-    slow = str(left["description"] or "").partition("; ")[2] if left["present"] is False else ""
-    tail = f"; unexplained: {left['description']}" if left["present"] else f"; of what is left {slow}" if slow else ""
+    noted = str(left["description"] or "").partition("; ")[2] if left["present"] is False else ""
+    tail = f"; unexplained: {left['description']}" if left["present"] else f"; noted: {noted}" if noted else ""
     doubt = outcome.get("calibration", {}).get("description", "")
     return f"{head}: {told}{tail}{_disagreement(outcome)}{f'; {doubt}' if doubt else ''}."
 

@@ -14,7 +14,7 @@ from magtensor.loop.fitting.seen import over_disturbances
 from magtensor.preparing import empty_survey
 from magtensor.recipe.plan import read_plan
 from magtensor.runner import run
-from magtensor.verdict import verdict
+from magtensor.verdict import sentence, verdict
 
 SPIKES = 25
 
@@ -90,3 +90,24 @@ def test_the_field_is_seen_over_what_is_disturbed() -> None:
     np.testing.assert_array_equal(seen[keep], field[keep])
     np.testing.assert_array_equal(seen[200:220], disturbed[200:220])
     np.testing.assert_array_equal(seen[299], disturbed[299])  # at the end of a run
+
+
+@pytest.mark.parametrize(("count", "told"), [(60, True), (20, False)])
+def test_many_are_told_and_make_nothing_unexplained(tmp_path: Path, count: int, told: bool) -> None:
+    """One axis that is off by 400 nT in one sample of 40, or of 120."""
+
+    def off(path: Path) -> None:
+        with h5py.File(path, "a") as file:
+            raw = file["b_raw"][:]
+            raw[np.linspace(20, len(raw) - 20, count).astype(int), 2, 1] += 400.0
+            file["b_raw"][:] = raw
+
+    found = verdict_of(tmp_path, scenario(54), off, ["offset_step"])
+    left = found["unexplained"]
+    words = (
+        "spikes: 60 samples (2.5%) fit no calibration, by 400 nT in the median, on S3: they are flagged and have no "
+        "part in the calibration"
+    )
+    assert not left["present"]
+    assert (words in left["description"]) is ("spikes" in left["description"]) is told
+    assert (f"noted: {words}" in sentence(found)) is told

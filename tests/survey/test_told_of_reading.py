@@ -12,7 +12,7 @@ from magtensor.errors import NotEnoughData
 from magtensor.runner import told_of_reading
 from magtensor.session import run_recipe
 from magtensor.simulate import simulate, write
-from magtensor.survey.flags import flag_ranges
+from magtensor.survey.flags import flag_ranges, summary
 from magtensor.survey.model import Survey
 
 RECIPE = Path(__file__).parents[2] / "recipes" / "closed_loop.yaml"
@@ -32,11 +32,29 @@ def test_a_large_loss_is_told_and_a_small_one_is_not() -> None:
     survey = Survey.build({"time": (["time"], time, {"units": "s"})}, {"notes": ["12 samples left out"]})
     flags = [
         *flag_ranges(time, time < 8, by="load", reason="few"),
-        *flag_ranges(time, (time > 20) & (time < 28), by="load", reason="many", sensor="S1"),
+        *flag_ranges(time, (time > 20) & (time < 32), by="load", reason="many", sensor="S1"),
         *flag_ranges(time, (time > 40) & (time < 48), by="load", reason="many", sensor="S2"),
+        *flag_ranges(time, (time > 60) & (time < 68), by="load", reason="few of each", sensor="S1"),
+        *flag_ranges(time, (time > 60) & (time < 68), by="load", reason="few of each", sensor="S2"),
     ]
     told = told_of_reading(survey.merged({}, flags))
-    assert told == ["as read: 12 samples left out", "not used: load: 14 samples of S1, S2: many (of 100)"]
+    assert told == ["as read: 12 samples left out", "not used: load: 7 to 11 samples of each of S1, S2: many (of 100)"]
+
+
+@pytest.mark.parametrize(
+    ("lost", "told"),
+    [
+        ({"S1": 13}, "13 samples of S1"),
+        ({"S2": 13, "S1": 13}, "13 samples of each of S1, S2"),
+        ({"S1": 13, "S2": 11, "S3": 12}, "11 to 13 samples of each of S1, S2, S3"),
+        ({"": 13}, "13 samples"),
+        ({"": 3, "S1": 10, "S2": 8}, "11 to 13 samples of each of S1, S2"),
+    ],
+)
+def test_samples_are_counted_by_sensor(lost: dict[str, int], told: str) -> None:
+    time = np.arange(100.0)
+    flags = [f for s, n in lost.items() for f in flag_ranges(time, time < n, by="load", reason="gone", sensor=s)]
+    assert summary(flags) == [f"load: {told}: gone"]
 
 
 def test_where_too_few_are_left_the_refusal_says_why(tmp_path: Path) -> None:

@@ -71,8 +71,10 @@ def summary(flags: Iterable[Flag]) -> list[str]:
 
 
 def much_lost(flags: Iterable[Flag], samples: int) -> list[str]:
-    """The lines of `summary` that take more than a tenth of a survey's samples, each with how many these are."""
-    return [f"{_line(group)} (of {samples})" for group in _groups(flags) if _count(group) > MUCH * samples]
+    """The lines of `summary` that take more than a tenth of a survey's samples from a sensor, each with how many the
+    survey has."""
+    lost = [group for group in _groups(flags) if max(_of_each(group).values()) > MUCH * samples]
+    return [f"{_line(group)} (of {samples})" for group in lost]
 
 
 def _groups(flags: Iterable[Flag]) -> list[list[Flag]]:
@@ -82,11 +84,16 @@ def _groups(flags: Iterable[Flag]) -> list[list[Flag]]:
     return list(groups.values())
 
 
-def _count(group: list[Flag]) -> int:
-    return sum(flag.samples for flag in group)
+def _of_each(group: list[Flag]) -> dict[str, int]:
+    """How many samples are flagged of each sensor that is named, those of the whole array among them; of "", where none
+    is named."""
+    sensors = sorted({flag.sensor for flag in group if flag.sensor}) or [""]
+    return {name: sum(flag.samples for flag in group if flag.sensor in ("", name)) for name in sensors}
 
 
 def _line(group: list[Flag]) -> str:
-    sensors = sorted({flag.sensor for flag in group if flag.sensor})
-    whose = f" of {', '.join(sensors)}" if sensors else ""
-    return f"{group[0].by}: {_count(group)} samples{whose}: {group[0].reason}"
+    each = _of_each(group)
+    least, most = min(each.values()), max(each.values())
+    count = f"{most}" if least == most else f"{least} to {most}"
+    whose = f" of {'each of ' * (len(each) > 1)}{', '.join(each)}" if any(each) else ""
+    return f"{group[0].by}: {count} samples{whose}: {group[0].reason}"

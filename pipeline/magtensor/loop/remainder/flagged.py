@@ -16,6 +16,7 @@ from magtensor.loop.fitting.refit import without
 from magtensor.loop.remainder.sparse_readings import SparseReadings
 
 LONGEST_SPIKE = 2  # samples: what lasts longer is no accident of the recording
+MANY_FLAGGED = 0.01  # of the samples: of what is left, some is in these
 HYSTERESIS = "hysteresis"
 UNCOVERED = 2.0  # steps between samples
 ALIKE = 0.1  # of the mean square along the field, across it: an effect on each sensor shows as much in both

@@ -21,8 +21,10 @@ from magtensor.loop.evidence.stretches import ABOUT, LEAST_LOUD
 from magtensor.loop.fitting.model import Fitting, Record, State
 from magtensor.loop.fitting.refit import disturbed, without
 from magtensor.loop.remainder.changing_matrix import changing_matrices
+from magtensor.loop.remainder.excess import excess_rms
 from magtensor.loop.remainder.flagged import (
     ALIKE,
+    MANY_FLAGGED,
     after_pauses,
     before_the_play,
     beyond_the_reference,
@@ -32,6 +34,7 @@ from magtensor.loop.remainder.flagged import (
 )
 from magtensor.loop.remainder.gradient_shape import MODEL, gradient_share
 from magtensor.loop.remainder.jitter import jitter_words
+from magtensor.loop.remainder.outlying import Outlying, outlying_words, spike_words
 from magtensor.loop.remainder.predictable import attitude_words, converter_words, shortened_words
 from magtensor.loop.remainder.sparse_readings import SparseReadings, sparse_readings
 from magtensor.loop.remainder.tones import of_the_turning
@@ -45,7 +48,6 @@ OF_A_LINE = 0.1  # of the square of what is left above the noise: less than that
 MUCH = 3.0  # times the white noise of an output: no base station beside a site differs by so much unnoticed
 TWICE = 2.0  # what the slow noise of the sensors, known from few frequencies, makes of it
 NO_NOISE = 5.0  # times the white noise: of noise whose power goes with 1/f the slow part has three at most
-MANY_FLAGGED = 0.01  # of the samples: of what is left, some is in these
 LOUD = 2.0  # times the usual noise
 PARTS = 10  # of a survey, that are compared
 NOISE = "what is left is noise: white, and slow noise of each sensor alone or of the reference"
@@ -59,9 +61,12 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
     bad = disturbed(record, state, found.how)
     starts, paused = after_pauses(bad, state.excitation)
     played, began = before_the_play(bad, state)
-    flagged = lasting(bad, beyond_the_reference(state, record) | played) | starts
+    unseen = beyond_the_reference(state, record)
+    flagged = lasting(bad, unseen | played) | starts
     suspects = Suspects.of(found, flagged, played, sparse)
-    words = [*_what_shows(found, record, excess, sparse), *suspects.words]
+    outlying = Outlying.of(state, record)
+    too_often, theirs = outlying_words(outlying, ~np.asarray(state.fit.keep))
+    words = [*_what_shows(found, record, excess, sparse), *suspects.words, *too_often]
     times = _slow(state, record) / state.residual.scale
     if not words and times > NO_NOISE:
         words.append(
@@ -78,11 +83,12 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
             + (f": {MODEL}, which cannot be tested without {lacks}, would look like this" if lacks else "")
         )
     if words:
-        in_use = " at the samples in use" if flagged.mean() > MANY_FLAGGED else ""
+        in_use = " at the samples in use" if bad.mean() > MANY_FLAGGED else ""
         size = f"{excess:.3g} nT rms above the white noise{in_use}, {_where(state)}"
         words.insert(0, size if excess else "in sum no more than the white noise, but no noise alone")
     beside += [sparse.words] if sparse is not None else suspects.noise_words
     beside += [*suspects.small_words, *([began] if began else [])]
+    beside += spike_words(outlying, bad & ~(lasting(bad) | starts | unseen | played | theirs))
     if record.absent:
         beside.append(f"not searched, for most of the survey lacks it: {', '.join(record.absent)}")
     if flagged.any():
@@ -135,7 +141,7 @@ def noise_words(state: State, record: Record) -> list[str]:
     if residual.across is not None:
         slow = slow_across(residual)
         if slow > white:
-            words.append(f"{slow:.3g} nT rms is not white, {_on_sensors(state)}")
+            words.append(f"{slow:.3g} nT rms of what is left is not white, {_on_sensors(state)}")
         else:
             sensors, axis = state.excitation.sensors, np.sqrt(np.mean(residual.noise.reshape(-1, 3) ** 2, axis=1))
             each = zip(sensors, np.sqrt(np.maximum(_beyond_white(residual), 0.0)), axis, strict=True)
@@ -244,11 +250,6 @@ def growing_words(name: str, steps: Array, elapsed: Array) -> list[str]:
     times = float(np.sqrt(loudness[loud] / loudness[quiet]))
     here, there = (f"from {elapsed[edges[k]]:.5g} to {elapsed[edges[k + 1]]:.5g} s" for k in (loud, quiet))
     return [f"the noise of {name} is {times:.2g} times as loud {here} as {there}"]
-
-
-def excess_rms(state: State) -> float:
-    """nT rms of the residual above the white noise."""
-    return float(np.sqrt(max(state.residual.square() - 1.0, 0.0)) * state.residual.scale)
 
 
 def strongest_line(state: State, record: Record) -> tuple[float, float] | None:
