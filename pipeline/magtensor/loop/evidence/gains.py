@@ -166,7 +166,9 @@ def _gain_between(
     if everywhere or not (before.any() or asked is not None):
         return gain
     judges = judged_by(n, normal(g.total())[0][0], before, asked)
-    return gain if len(judges) == folds else Gain(*(a[judges] for a in (gain.before, gain.after, gain.values)), judges)
+    if len(judges) == folds:
+        return gain
+    return Gain(gain.before[judges], gain.after[judges], gain.values[judges], judges)
 
 
 def judged_by(
@@ -180,10 +182,10 @@ def judged_by(
     n: (folds, P, P) information outside each, the fit's own freedom projected off; every: (P, P) of all blocks.
     """
     known = np.diagonal(n, axis1=1, axis2=2) / np.maximum(np.diagonal(every), 1e-300)
-    judges = (known[:, given] >= 1.0 - CONCENTRATED).all(axis=1)
+    judges = np.asarray((known[:, given] >= 1.0 - CONCENTRATED).all(axis=1))
     if asked is not None:
         judges &= known[:, asked].mean(axis=1) >= NOTHING
-    return np.flatnonzero(judges if judges.sum() > MOST_FOLDS * len(judges) else np.ones_like(judges))
+    return np.flatnonzero(judges) if judges.sum() > MOST_FOLDS * len(judges) else np.arange(len(judges))
 
 
 def interleaved_gain(g: Grams, freedom: int, before: NDArray[np.bool_], after: NDArray[np.bool_]) -> Gain:
@@ -225,7 +227,7 @@ def _gain_and_known(
     before: NDArray[np.bool_],
     after: NDArray[np.bool_],
 ) -> tuple[Gain, Array]:
-    """The same and the information (folds, P, P) on all terms outside each fold, the fit's own freedom projected off."""
+    """The same, and the information (folds, P, P) outside each fold, the fit's own freedom projected off."""
     train, test = g.chosen(train_masks), g.chosen(test_masks)
     n, y = normal(train)
     own = own_information(g)
