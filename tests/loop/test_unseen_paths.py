@@ -38,3 +38,18 @@ def test_what_hysteresis_leaves_between_postures_is_no_source(seed: int, tmp_pat
     effect = {"type": "hysteresis", "rms_nT": 0.06, "half_width_nT": [4000.0]}
     told = verdict_of(tmp_path, scenario(seed, effect, motion=POSTURES), None, ["hysteresis", "latent_source"])
     assert adopted_names(told) == {"hysteresis"}
+
+
+@pytest.mark.parametrize("seed", [71, pytest.param(76, marks=pytest.mark.long)])
+@pytest.mark.parametrize("effect", ["bandwidth", pytest.param("eddy_current", marks=pytest.mark.long)])
+def test_what_is_quicker_than_the_way_between_postures_has_no_other_name(
+    effect: str, seed: int, tmp_path: Path
+) -> None:
+    """A filter that still remembers the way to a posture while its mean is taken: memory that is too quick to be told,
+    of which a slow body, a play or the logged acceleration explain most."""
+    models = ["viscous_magnetisation", "hysteresis", "channel_response", "alignment_drift", "turn_step", "offset_while"]
+    description = scenario(seed, {"type": effect, "rms_nT": 4.5}, motion=POSTURES, logging={"acceleration": True})
+    told = verdict_of(tmp_path, description, None, [*models, effect])
+    assert adopted_names(told) == set()
+    assert told["unexplained"]["present"]
+    assert "something quicker would do" in told["unexplained"]["description"]

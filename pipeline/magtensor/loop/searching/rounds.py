@@ -280,8 +280,8 @@ class Rounds:
 
     def of_another(self, chosen: Candidate, state: State) -> str:
         """Why a candidate, before it is fitted, is taken for a part of what another model explains; "" if it is not."""
-        if name := rate_instead(chosen, state, self.models):
-            return f"{name}, for which the field turns too fast between samples, explains more"
+        if why := rate_instead(chosen, state, self.models):
+            return why
         return part_of_a_larger_law(chosen, state) or part_of_a_gradient(chosen, state)
 
     def kept_with_another(

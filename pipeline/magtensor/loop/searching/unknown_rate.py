@@ -3,7 +3,10 @@
 A walk whose steps are as quick as the samples, a tumbling rig read too seldom: an error model that needs the field's
 rate of change is not tested then, and a model that remembers the field, whose part that depends on how it turns is
 computed from the same samples, would be adopted for what a delay makes. The rate is not known, but roughly: taken as it
-comes out, it explains of a true delay more than such a model does, and of what remembers the field less.
+comes out, it explains of a true delay more than such a model does, and of what remembers the field less. Nor is the way
+seen that an array takes from one posture to the next: what still remembers it while the mean of a posture is taken,
+a filter or an eddy current, goes with how this posture differs from the one before, as does all memory that is quicker
+than the samples show.
 """
 
 from __future__ import annotations
@@ -13,16 +16,18 @@ from collections.abc import Sequence
 from magtensor.components import Component
 from magtensor.error_models.excitation import Excitation
 from magtensor.error_models.needs import missing
-from magtensor.error_models.settings import EventTimes, profiled
+from magtensor.error_models.settings import EventTimes, Range, profiled
 from magtensor.error_models.terms import Terms, joined
 from magtensor.loop.evidence.assessment import estimated_in, explained
 from magtensor.loop.evidence.grams import Whitened
 from magtensor.loop.fitting.model import State
+from magtensor.loop.fitting.separation import fold_gain, separated
 from magtensor.loop.searching.gates import Candidate
 from magtensor.loop.searching.profiling import settings_grid, terms_of
 
 NEED = "rotation"
 HALF = 0.5
+QUICKER = 0.25  # of the shortest time that samples show: next to nothing is remembered but the sample before
 
 
 def of_the_rate(x: Excitation, models: Sequence[Component]) -> list[Component]:
@@ -32,8 +37,11 @@ def of_the_rate(x: Excitation, models: Sequence[Component]) -> list[Component]:
 
 
 def rate_instead(chosen: Candidate, state: State, models: Sequence[Component]) -> str:
-    """The error model that the survey is sampled too slowly for, but with the rate as it comes out explains more than a
-    candidate, which explains less than half of its own part beside it; "" if there is none.
+    """Why a candidate is no more than a part of what turns faster than the survey was sampled; "" if it is not.
+
+    An error model that the survey is sampled too slowly for, with the rate as it comes out, explains more, and beside
+    it the candidate explains less than half of its own part; or a memory that is quicker than the samples show predicts
+    more, and beside it the candidate nothing.
 
     Parameters
     ----------
@@ -41,7 +49,10 @@ def rate_instead(chosen: Candidate, state: State, models: Sequence[Component]) -
     """
     if not (lacking := of_the_rate(state.excitation, models)):
         return ""
-    seen, colours = chosen.before or state, chosen.assessment.colours  # at the samples of its terms
+    seen = chosen.before or state  # at the samples of its terms
+    if name := _quicker(chosen, seen, models):
+        return f"{name} with a time constant shorter than the samples show predicts as much: something quicker would do"
+    colours = chosen.assessment.colours
     white = Whitened.of(seen.residual, colours.across, colours.along, seen.terms, over_time=False)
     own = explained(estimated_in(white, None)) if seen.terms is not None else 0.0
 
@@ -57,5 +68,25 @@ def rate_instead(chosen: Candidate, state: State, models: Sequence[Component]) -
             terms = terms.at(seen.residual.samples)
             known = gain(terms)
             if known > alone and gain(joined([terms, chosen.terms])) - known < HALF * alone:
-                return model.name
+                return f"{model.name}, for which the field turns too fast between samples, explains more"
+    return ""
+
+
+def _quicker(chosen: Candidate, state: State, models: Sequence[Component]) -> str:
+    """The model whose time constant may not be shorter than the samples show, but with a shorter one is ahead of a
+    candidate, or of itself no worse, and leaves it nothing; "" if there is none."""
+    colours, x = chosen.assessment.colours, state.excitation
+    for model in models:
+        shorter = {n: QUICKER * g.least(x) for n, g in profiled(model).items() if isinstance(g, Range) and g.sampled}
+        terms = terms_of(model, shorter, x, {}) if shorter else None
+        if terms is None:
+            continue
+        terms = terms.at(state.residual.samples)
+        quick, own = (fold_gain(state, colours, each) for each in (terms, chosen.terms))
+        spare = max(terms.count - chosen.terms.count, 0)
+        same = model.name == chosen.model.name
+        if not (separated(quick, own, spare) or (same and not separated(own, quick))):
+            continue
+        if not separated(fold_gain(state, colours, terms, chosen.terms), quick):
+            return model.name
     return ""
