@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import h5py
 import numpy as np
 import pytest
-from loop_cases import BASE, adopted_names, scenario, verdict_of
+from loop_cases import BASE, adopted_names, looked_at, scenario, synthetic, verdict_of
 from numpy.typing import NDArray
 from scipy.fft import idct
 
 from magtensor.error_models.example import example_survey
 from magtensor.error_models.settings import profiled
 from magtensor.loop.evidence.colour import colour_of
+from magtensor.loop.fitting.model import Adopted, Fitting
+from magtensor.loop.fitting.refit import joint_state
 from magtensor.loop.fitting.separation import plainer
 from magtensor.loop.searching.course_of_time import FIRST_LEFT
+from magtensor.loop.searching.kin import explained_by_courses
 from magtensor.registry import Registry
 from magtensor_effects.ageing import courses
 
@@ -139,3 +143,26 @@ def test_slow_noise_is_known_below_what_courses_have_taken() -> None:
     assert found.power is not None
     assert found.power[1] == pytest.approx(1.0 + corner, rel=0.75)
     assert colour_of(idct(spectrum, axis=0, norm="ortho"), stiff=True).lowest < 2.0, "as if none were there"
+
+
+@pytest.mark.parametrize(
+    ("adopted", "course"), [("calibration_step", False), ("offset_step", False), ("scale_drift", True)]
+)
+def test_what_an_event_leaves_is_no_smooth_course(adopted: str, course: bool) -> None:
+    """A jump far larger than what a thermometer explains beside it: that may be the law of a drift, and no jump's."""
+    time = np.arange(1200) / 1200.0
+    large = 40.0 * (np.where(time > 0.6, 1.0, 0.0) if adopted != "scale_drift" else time**2)
+    warms = 0.6 * (np.sqrt(time) + 0.1 * np.sin(9.0 * time))
+    drawn = np.random.default_rng(4).standard_normal((2, 4, 3))
+    plain = synthetic(31, noise_nT=0.3, turning_s=4.0)
+    added = (large[:, None, None] * drawn[0] + warms[:, None, None] * drawn[1]) * plain.raw / 50_000.0
+    record = replace(
+        synthetic(31, noise_nT=0.3, turning_s=4.0, added=added), logged={"temperature": warms},
+        origins={"temperature": np.zeros(())}, units={"temperature": "degC"},
+    )  # fmt: skip
+    registry = Registry.load()
+    settings = {"order": 1, "span_s": 1200.0} if course else {"time_s": 720.0}
+    state = joint_state(record, [Adopted(registry.find("error_model", adopted), settings)], Fitting())
+    response = {"order": 1, "channel": "temperature", "lag_s": 0.0, "delayed": False, "at_start": 0.0}
+    found = looked_at(state, Adopted(registry.find("error_model", "temperature_scale"), response))
+    assert (explained_by_courses(state, found) > 10.0 * found.assessment.gain.total) == course

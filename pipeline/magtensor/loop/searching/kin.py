@@ -18,7 +18,7 @@ from magtensor.error_models.settings import Duration, EventTimes, Range, profile
 from magtensor.error_models.terms import Terms
 from magtensor.loop.evidence.assessment import NEARLY_ALL, Assessment
 from magtensor.loop.fitting.model import Adopted, State, generic
-from magtensor.loop.searching.contribution import a_tone, moments
+from magtensor.loop.searching.contribution import a_tone, happens_once, moments
 from magtensor.loop.searching.gates import Candidate, explained_by, seen_between
 
 MOST = 0.5  # of what a candidate explains
@@ -52,17 +52,27 @@ def explained_by_kin(state: State, model: Adopted, terms: Terms, assessment: Ass
 
 
 def explained_by_courses(state: State, candidate: Candidate) -> float:
-    """Sum of squares that adopted effects explain which go with time and have the candidate's sensors."""
-    return _explained(state, {TIME}, candidate.model, candidate.terms, candidate.assessment)
+    """Sum of squares that adopted effects explain which go with time all along and have the candidate's sensors: what
+    something that happened once leaves is no smooth course."""
+    lasting = [place for place, other in enumerate(state.adopted) if not happens_once(other)]
+    return _explained(state, {TIME}, candidate.model, candidate.terms, candidate.assessment, lasting)
 
 
-def _explained(state: State, by: set[str], model: Adopted, terms: Terms, assessment: Assessment) -> float:
+def _explained(
+    state: State,
+    by: set[str],
+    model: Adopted,
+    terms: Terms,
+    assessment: Assessment,
+    places: Sequence[int] | None = None,
+) -> float:
     theta = assessment.estimate.theta[-terms.count :]
     between = seen_between(state.residual, terms, theta)  # where nothing of the reference is
     kin = [
         place
         for place, other in enumerate(state.adopted)
         if other.name != model.name
+        and (places is None or place in places)
         and not _of_one_moment(model, other, state.excitation)
         and not _holds(model, terms, state, place)
         and not (between and other.component.effect == "reference")
