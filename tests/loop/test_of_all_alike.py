@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
-from loop_cases import scenario, synthetic, verdict_of
+from loop_cases import linear_state, looked_at, scenario, synthetic, verdict_of
 
 from magtensor.loop.fitting.model import Adopted, Fitting
 from magtensor.loop.fitting.refit import joint_state
 from magtensor.loop.searching.contribution import of_all_alike
+from magtensor.loop.searching.own_fit import plainer_forms
 from magtensor.registry import Registry
 
 FOLLOWING = ["temperature_scale", "temperature_offset", "channel_response"]
@@ -57,3 +59,17 @@ def test_a_base_station_that_follows_the_temperature_is_no_fault_of_the_sensors(
 def test_scale_factors_that_follow_the_temperature_each_by_its_own_are_the_sensors(tmp_path: Path) -> None:
     told = verdict_of(tmp_path, scenario(61, {"type": "temperature_scale", "rms_nT": 0.3}), models=FOLLOWING)
     assert [a["error_model"] for a in told["adopted"]] == ["temperature_scale"]
+
+
+@pytest.mark.parametrize("sensors", [1, 3])
+def test_a_delay_of_all_axes_is_asked_of_sensors_that_show_it(sensors: int) -> None:
+    """Axes that are read in turn. What one sensor's whole vector is late by no length shows, and a fit of that goes
+    anywhere; several sensors show what they are late by beside each other."""
+    plain = synthetic(4, 2000, sensors, noise_nT=0.2, turning_s=3.0)
+    rate = np.gradient(plain.raw, axis=0)
+    late = np.array([4e-5, -2e-5, 0.0]) + 1e-3 * np.arange(sensors)[:, None]
+    record = replace(plain, raw=plain.raw - late * rate)
+    state = linear_state(record)
+    model = Adopted(Registry.load().find("error_model", "sampling_lag"), {"per_axis": True}, record.sensors)
+    plainer = plainer_forms(looked_at(state, model), state)
+    assert [c.model.settings["per_axis"] for c in plainer] == ([False] if sensors > 1 else [])

@@ -19,7 +19,7 @@ from magtensor.loop.evidence.assessment import Assessment, assess, colours_of
 from magtensor.loop.evidence.grams import Whitened
 from magtensor.loop.fitting.model import Fitting, Record, State
 from magtensor.loop.fitting.refit import joint_state
-from magtensor.loop.fitting.separation import fold_gain, plainer, separated
+from magtensor.loop.fitting.separation import SEPARATION, fold_gain, plainer, separated
 from magtensor.loop.searching.contribution import happens_once, put_back, slices
 from magtensor.loop.searching.gates import Candidate
 from magtensor.sharing import shared_out
@@ -39,7 +39,7 @@ def at_their_own_fit(candidates: Sequence[Candidate], record: Record, state: Sta
     if large:
         least = AS_MUCH * max(c.assessment.gain.total for c in candidates)
         large = [c for c in candidates if c in large or (c.significant and c.assessment.gain.total > least)]
-    each_with = [[c, *_below(c, state)] for c in large]
+    each_with = [[c, *plainer_forms(c, state)] for c in large]
     tried = [c for several in each_with for c in several]
     judged = iter(shared_out(lambda c: _judged(c, record, state, how), tried))
     again = {}
@@ -50,15 +50,17 @@ def at_their_own_fit(candidates: Sequence[Candidate], record: Record, state: Sta
     return sorted((again.get(id(c), c) for c in candidates), key=lambda c: -c.assessment.gain.total)
 
 
-def _below(candidate: Candidate, state: State) -> list[Candidate]:
-    """The same model in every plainer form."""
+def plainer_forms(candidate: Candidate, state: State) -> list[Candidate]:
+    """The same model in every plainer form that explains something before it is fitted: a delay of all axes alike may
+    be nothing that the lengths of one sensor's field show, and a fit of it would go anywhere."""
     model, residual, below = candidate.model, state.residual, []
     for settings in plainer(model.settings, profiled(model.component)):
         lower = replace(model, settings=settings)
         terms = lower.terms(state.excitation).at(residual.samples)
         now = Whitened.of(residual, state.colours.across, state.colours.along, state.terms)
         assessment = assess(now, terms, once=happens_once(model))
-        below.append(replace(candidate, model=lower, terms=terms, assessment=assessment))
+        if assessment.estimate.explained_beside(len(assessment.theta) - terms.count) > SEPARATION:
+            below.append(replace(candidate, model=lower, terms=terms, assessment=assessment))
     return below
 
 
