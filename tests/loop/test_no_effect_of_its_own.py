@@ -104,7 +104,7 @@ def telegraph(seed: int, time: Array, dwell_s: float) -> Array:
 @pytest.mark.parametrize(
     ("survey", "seed", "dwell_s", "size", "models", "words"),
     [
-        (96, 6, 60.0, 0.4, ["offset_while", "turn_step"], "no lone event"),
+        (96, 7, 40.0, 0.3, ["offset_while", "turn_step"], "no lone event"),
         (94, 5, 90.0, 1.0, ["offset_while", "offset_step"], "switches along one vector"),
     ],
     ids=["one is found", "several are found"],
