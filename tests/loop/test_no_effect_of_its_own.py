@@ -65,6 +65,24 @@ def test_kin_have_one_driver_and_one_sensor() -> None:
     assert explained_by_kin(state, offset, *assessed(state, offset, "S2")) == 0.0  # more of the same has another lag
 
 
+def test_an_event_beside_a_response_that_has_no_law_is_of_its_kind() -> None:
+    """Its time was sought in what the response leaves, which nobody knows the law of."""
+    added = np.zeros((1200, 4, 3))
+    added[:, 1] = 20.0 * COURSE[:, None]
+    settings = {"channel": "temperature", "power": 1}
+    response = replace(model("channel_response", **settings), sensors=("S2",))
+    state = joint_state(logged(synthetic(92, added=added)), [response], Fitting())
+    event, scale = model("offset_step", time_s=500.0), model("scale_drift", order=1, span_s=1199.0)
+    of_the_same = explained_by_kin(state, event, *assessed(state, event, "S2"))
+    assert of_the_same == pytest.approx(np.sum(added**2) * 0.75, rel=0.3)
+    assert explained_by_kin(state, event, *assessed(state, event, "S3")) == 0.0  # another sensor
+    assert explained_by_kin(state, scale, *assessed(state, scale, "S2")) == 0.0  # it lasts
+    named = joint_state(
+        logged(synthetic(92, added=added)), [model("temperature_offset", channel="temperature")], Fitting()
+    )
+    assert explained_by_kin(named, event, *assessed(named, event, "S2")) == 0.0  # of a law that is known
+
+
 @pytest.mark.parametrize(("gain", "refused"), [(0.9, True), (1.1, False)])
 def test_what_the_law_of_its_kin_may_miss_is_refused(gain: float, refused: bool) -> None:
     kin = 4e5

@@ -47,7 +47,8 @@ def explained_beside(state: State, model: Adopted, terms: Terms, assessment: Ass
 
 
 def explained_by_kin(state: State, model: Adopted, terms: Terms, assessment: Assessment) -> float:
-    """Sum of squares that adopted effects of another name explain which have the candidate's sensors and driver."""
+    """Sum of squares that adopted effects of another name explain which have the candidate's sensors and driver, or no
+    law that anybody wrote where it happens once: its time was sought in all that such a response leaves."""
     return _explained(state, drivers(model, state.excitation), model, terms, assessment)
 
 
@@ -76,7 +77,7 @@ def _explained(
         and not _of_one_moment(model, other, state.excitation)
         and not _holds(model, terms, state, place)
         and not (between and other.component.effect == "reference")
-        and by & drivers(other, state.excitation)
+        and (by & drivers(other, state.excitation) or (generic(other) and happens_once(model)))
         and _held_by(other.sensors or state.excitation.sensors, state, terms, assessment) > NEARLY_ALL
     ]
     return explained_by(state, kin) if kin else 0.0
