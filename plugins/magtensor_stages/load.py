@@ -98,6 +98,9 @@ def load(
     return loaded.merged({**_described(loaded), **given}, flags)
 
 
+MOST_FAULTS = 0.5  # of the times: with more it is no clock with faults
+
+
 def _clock(seconds: float) -> str:
     return f"t = {seconds:.3f} s"
 
@@ -121,6 +124,13 @@ def _increasing(survey: Survey, time_faults: str, where: str, notes: list[str]) 
     else:
         what = f"the clock steps back at sample {first}, from {_clock(before)} to {_clock(now)}"
     count = int((~onward).sum())
+    if count > MOST_FAULTS * len(time):
+        backwards = bool(np.all(np.diff(time[np.isfinite(time)]) <= 0))
+        raise DataError(
+            "the times run backwards" if backwards else f"{what}; {count} samples of {len(time)} do not move on",
+            where=f"{where}: time",
+            hint="no survey is left without so many: sort the rows by time, or look whether the clock was read right",
+        )
     if time_faults == "refuse":
         raise DataError(
             f"{what}; {count} sample{'s' * (count > 1)} of {len(time)} do not move on",

@@ -63,7 +63,7 @@ REFUSED: dict[str, tuple[Callable[[Lines], Any], str]] = {
     "zeros": (lambda lines: bytes(4000), r"log\.csv"),
     "words": (lambda lines: [lines[0], *(",".join(["x"] * 13) for _ in lines[1:])], r"log\.csv"),
     "a time twice": (lambda lines: [*lines[:50], lines[49], *lines[50:]], "same time as the one before"),
-    "backwards": (lambda lines: [lines[0], *lines[:0:-1]], "the clock steps back"),
+    "backwards": (lambda lines: [lines[0], *lines[:0:-1]], "the times run backwards"),
     "microtesla": (lambda lines: [lines[0], *map(thousandth, lines[1:])], "looks like uT labelled nT"),
 }
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
 import pytest
 
-from magtensor.errors import NotEnoughData
+from magtensor.errors import DataError, NotEnoughData
 from magtensor.runner import told_of_reading
 from magtensor.session import run_recipe
 from magtensor.simulate import simulate, write
@@ -16,7 +17,7 @@ from magtensor.survey.flags import flag_ranges, summary
 from magtensor.survey.model import Survey
 
 RECIPE = Path(__file__).parents[2] / "recipes" / "closed_loop.yaml"
-SURVEY = {
+SURVEY: dict[str, Any] = {
     "title": "unordered stamps",
     "seed": 3,
     "rate_Hz": 2.0,
@@ -58,10 +59,25 @@ def test_samples_are_counted_by_sensor(lost: dict[str, int], told: str) -> None:
 
 
 def test_where_too_few_are_left_the_refusal_says_why(tmp_path: Path) -> None:
+    few = SURVEY | {"motion": SURVEY["motion"] | {"duration_s": 4.0}}
+    write(simulate(few), tmp_path / "survey.h5")
+    with h5py.File(tmp_path / "survey.h5", "a") as file:
+        file["time"][4:7] = file["time"][3]
+    with pytest.raises(NotEnoughData, match=r"as read: 3 samples left out whose time does not move on"):
+        run_recipe(RECIPE, tmp_path / "out", survey=tmp_path / "survey.h5")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("order", "told"),
+    [("reversed", "time: the times run backwards"), ("shuffled", r"time: .* \d+ samples of 400 do not move on")],
+)
+def test_times_in_another_order_are_no_faults_of_a_clock(order: str, told: str, tmp_path: Path) -> None:
+    """Dropping what does not move on would leave a handful of samples, or a single one."""
     write(simulate(SURVEY), tmp_path / "survey.h5")
     with h5py.File(tmp_path / "survey.h5", "a") as file:
         time = file["time"][:]
-        file["time"][:] = time[np.random.default_rng(1).permutation(len(time))]
-    with pytest.raises(NotEnoughData, match=r"as read: \d+ samples left out whose time does not move on"):
+        file["time"][:] = time[::-1] if order == "reversed" else time[np.random.default_rng(1).permutation(len(time))]
+    with pytest.raises(DataError, match=told):
         run_recipe(RECIPE, tmp_path / "out", survey=tmp_path / "survey.h5")
     assert not (tmp_path / "out").exists()

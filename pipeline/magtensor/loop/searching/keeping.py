@@ -29,12 +29,14 @@ from magtensor.loop.searching.gates import Candidate
 from magtensor.loop.searching.left_out import better_left_out
 from magtensor.loop.searching.likeness import event_along
 from magtensor.loop.searching.on_fewer_sensors import narrowed
+from magtensor.loop.searching.one_direction import VISCOUS, of_one_direction
 from magtensor.loop.searching.profiling import already
 from magtensor.loop.searching.rivals import hardly_begun
 
 NOT_AS_ASSUMED = "fitted, its coefficients are not what its settings assume"
 ONE_OF_A_KIND = "fitted, it comes out the same as one that is adopted already"  # its law is no single one
 MOST_OF_DIFFERENCES = 0.1  # positions wrong by a tenth of the array, where its law ends to be of first order
+LIKE_HEAT = "what the sun, or an engine, warms on one side would look the same"
 UNEARNED = "fitted, it does not earn its place on held-out blocks"
 
 
@@ -118,6 +120,8 @@ def why_not(record: Record, before: Trial, after: Trial, chosen: Candidate, how:
         return "fitted, it would have begun as far from what it follows as is possible: something else dies away"
     if shorter := _shorter_than_shown(model, x):
         return f"fitted, its {shorter} is shorter than the samples can show: something quicker would do as well"
+    if model.name == VISCOUS and of_one_direction(after.state, which):
+        return f"fitted, it goes with one direction of the lagged field: {LIKE_HEAT}"
     if not agrees(after.state, which):
         return NOT_AS_ASSUMED
     if (share := share_of_differences(after.state, which)) > MOST_OF_DIFFERENCES:

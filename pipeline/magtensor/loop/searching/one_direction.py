@@ -1,0 +1,75 @@
+"""Whether what lags the field goes with one direction of it only: then it need not be the field that is lagged.
+
+Iron that is magnetised late shows the field through a matrix at each sensor, and one piece of another form or place
+than the other, another matrix. A board that is warmed on the side that faces the sun, or a hot engine, is moved along
+one vector at each sensor by one temperature, which lags the attitude: to first order a component of the field along one
+direction, the same for all sensors. What such a direction explains nearly all of may be either.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magtensor.calibration.types import Array
+from magtensor.loop.evidence.assessment import estimated
+from magtensor.loop.fitting.model import State
+from magtensor.loop.searching.contribution import put_back, slices
+
+VISCOUS = "viscous_magnetisation"
+CHANCE = 0.01  # probability that noise alone makes the other directions explain as much
+HALF = 0.5  # of what matrices without any order would leave beside one direction
+_ROUNDS = 50
+
+
+def of_one_direction(state: State, which: int) -> bool:
+    """Whether one direction of the lagged field explains what an adopted model with a matrix for each sensor does: all
+    but what chance makes of the others, or half of what is left of matrices whose entries are alike at random."""
+    from scipy.special import chdtri
+
+    assert state.terms is not None
+    own = slices(state)[which]
+    every = [i for i in range(state.terms.count) if not own.start <= i < own.stop]
+    terms = state.terms.only([*every, *range(own.start, own.stop)])
+    found = estimated(put_back(state.residual, state.terms, np.concatenate(state.theta)), terms, state.colours)
+    theta, information = found.theta[len(every) :], found.beside(len(every))
+    sensors = len(theta) // 9
+    lost = beside_one_direction(theta.reshape(sensors, 3, 3), information)
+    freedom = 9 * sensors - (3 * sensors + 2)
+    least = float(chdtri(freedom, CHANCE))
+    return lost < max(least, HALF * left_by_chance(sensors) * float(theta @ information @ theta))
+
+
+def beside_one_direction(matrices: Array, information: Array) -> float:
+    """The sum of squares that matrices (S, 3, 3) explain beside the best k_s w' with one w for all of them.
+
+    Parameters
+    ----------
+    information: (9 S, 9 S) on their entries.
+    """
+    sensors, theta = len(matrices), matrices.ravel()
+    found = []
+    w: Array
+    for w in np.linalg.svd(matrices.reshape(-1, 3))[2]:
+        for _ in range(_ROUNDS):
+            k = _least(np.kron(np.eye(3 * sensors), w[:, None]), theta, information)
+            w = _least(np.kron(k[:, None], np.eye(3)), theta, information)
+            w = np.asarray(w / max(float(np.linalg.norm(w)), 1e-300), dtype=float)
+        made = np.kron(np.eye(3 * sensors), w[:, None])
+        left = theta - made @ _least(made, theta, information)
+        found.append(float(left @ information @ left))
+    return min(found)
+
+
+def _least(columns: NDArray[np.floating[Any]], theta: Array, information: Array) -> Array:
+    """Coefficients of columns (9 S, K) that come nearest to theta (9 S,)."""
+    seen = columns.T @ information
+    return np.asarray(np.linalg.lstsq(seen @ columns, seen @ theta, rcond=1e-9)[0])
+
+
+def left_by_chance(sensors: int) -> float:
+    """The share of its squares that a (3 S, 3) matrix of random entries has beside its largest singular value."""
+    values = np.linalg.svd(np.random.default_rng(1).standard_normal((200, 3 * sensors, 3)), compute_uv=False) ** 2
+    return float(np.mean(1.0 - values[:, 0] / values.sum(axis=1)))

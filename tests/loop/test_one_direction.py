@@ -1,0 +1,64 @@
+"""Heat of the side that faces the sun follows the attitude late, as slow iron does, but along one direction of it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from loop_cases import Array, synthetic
+
+from magtensor.loop.fitting.model import Adopted, Fitting
+from magtensor.loop.fitting.refit import joint_state
+from magtensor.loop.searching.one_direction import beside_one_direction, left_by_chance, of_one_direction
+from magtensor.registry import Registry
+
+TAU_S = 40.0
+
+
+def late(course: Array) -> Array:
+    """(N, K) through a body of heat, or iron, that follows with a time constant; samples of one second, in hundredths
+    of which it goes on."""
+    out, now = np.empty_like(course), course[0]
+    for n, value in enumerate(course):
+        for _ in range(100):
+            now = now + 0.01 / TAU_S * (value - now)
+        out[n] = now
+    return out
+
+
+@pytest.mark.parametrize("sensors", [1, 4])
+@pytest.mark.parametrize("iron", [True, False])
+@pytest.mark.parametrize("seed", [3, 5])
+def test_iron_shows_the_field_and_heat_one_direction(seed: int, iron: bool, sensors: int) -> None:
+    """The sun stands somewhere else than the field, and warms nothing from behind."""
+    rng = np.random.default_rng(seed)
+    plain = synthetic(seed, sensors=sensors, noise_nT=0.2, turning_s=8.0)
+    u = plain.raw.mean(axis=1) - plain.raw.mean(axis=(0, 1))
+    u /= np.linalg.norm(u, axis=1)[:, None]
+    if iron:
+        matrix = 4.0 * (np.eye(3) + 0.4 * rng.standard_normal((sensors, 3, 3)))
+        added = np.einsum("sij,nj->nsi", matrix, late(u) - u)
+    else:
+        beside = np.cross(u, synthetic(seed + 50, sensors=1, turning_s=8.0).raw[:, 0])
+        sun = 0.8 * u + 0.6 * beside / np.linalg.norm(beside, axis=1)[:, None]
+        side = np.array([0.6, -0.3, 0.74])
+        added = 30.0 * late(np.maximum(sun @ side, 0.0)[:, None])[:, None] * rng.standard_normal((sensors, 3))
+    record = replace(plain, raw=plain.raw + added)
+    settings = {"tau_s": TAU_S, "at_start_x_nT": 0.0, "at_start_y_nT": 0.0, "at_start_z_nT": 0.0}
+    model = Adopted(Registry.load().find("error_model", "viscous_magnetisation"), settings)
+    assert of_one_direction(joint_state(record, [model], Fitting()), 0) is not iron
+
+
+def test_what_one_direction_leaves_of_matrices() -> None:
+    rng = np.random.default_rng(2)
+    k, w = rng.standard_normal((4, 3)), rng.standard_normal(3)
+    one = np.einsum("si,j->sij", k, w)
+    root = rng.standard_normal((36, 36))
+    information = root @ root.T
+    assert beside_one_direction(one, information) < 1e-9 * one.ravel() @ information @ one.ravel()
+    # where all entries are known alike it is the sum of squares of the smaller singular values
+    some = rng.standard_normal((4, 3, 3))
+    smaller = np.linalg.svd(some.reshape(12, 3), compute_uv=False)[1:]
+    assert beside_one_direction(some, np.eye(36)) == pytest.approx(np.sum(smaller**2), rel=1e-6)
+    assert 0.2 < left_by_chance(1) < left_by_chance(4) < 2.0 / 3.0
