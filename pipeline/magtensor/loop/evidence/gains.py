@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtensor.calibration.types import Array
-from magtensor.loop.evidence.estimate import own_information, theta_of_each
+from magtensor.loop.evidence.estimate import IDENTIFIABLE, own_information, theta_of_each
 from magtensor.loop.evidence.folds import FOLDS, NOTHING, Blocks
 from magtensor.loop.evidence.grams import Grams, held_out, normal
 from magtensor.loop.evidence.statistics import LEAST_BLOCKS
@@ -162,26 +162,25 @@ def _gain_between(
         train_masks[k, max(a - gap, 0) : b + gap] = False
     every = np.ones(g.count, dtype=bool)
     before = ~every if blocked is None else blocked
-    gain, n = _gain_and_known(g, freedom, test_masks, train_masks, before, every)
+    gain, n = gain_over(g, freedom, test_masks, train_masks, before, every)
     if everywhere or not (before.any() or asked is not None):
         return gain
-    judges = judged_by(n, normal(g.total())[0][0], before, asked)
+    known = np.diagonal(normal(g.total())[0][0])
+    seen = known > IDENTIFIABLE * own_information(g).information
+    judges = judged_by(np.diagonal(n, axis1=1, axis2=2) / np.where(seen, known, 1.0), before & seen, asked)
     if len(judges) == folds:
         return gain
     return Gain(gain.before[judges], gain.after[judges], gain.values[judges], judges)
 
 
-def judged_by(
-    n: Array, every: Array, given: NDArray[np.bool_], asked: NDArray[np.bool_] | None = None
-) -> NDArray[np.int_]:
+def judged_by(known: Array, given: NDArray[np.bool_], asked: NDArray[np.bool_] | None = None) -> NDArray[np.int_]:
     """The numbers of the folds outside which something is known of each of the given terms (P,), and of those `asked`
     together; all, where these are too few.
 
     Parameters
     ----------
-    n: (folds, P, P) information outside each, the fit's own freedom projected off; every: (P, P) of all blocks.
+    known: (folds, P) part of what is known of each term, the fit's own freedom projected off, that is outside each.
     """
-    known = np.diagonal(n, axis1=1, axis2=2) / np.maximum(np.diagonal(every), 1e-300)
     judges = np.asarray((known[:, given] >= 1.0 - CONCENTRATED).all(axis=1))
     if asked is not None:
         judges &= known[:, asked].mean(axis=1) >= NOTHING
@@ -196,7 +195,7 @@ def interleaved_gain(g: Grams, freedom: int, before: NDArray[np.bool_], after: N
     folds = min(INTERLEAVED_FOLDS, len(g.zz))
     number = np.arange(len(g.zz)) % folds
     test_masks = number == np.arange(folds)[:, None]
-    return gain_over(g, freedom, test_masks, ~test_masks, before, after)
+    return gain_over(g, freedom, test_masks, ~test_masks, before, after)[0]
 
 
 def gain_over(
@@ -206,8 +205,9 @@ def gain_over(
     train_masks: NDArray[np.bool_],
     before: NDArray[np.bool_],
     after: NDArray[np.bool_],
-) -> Gain:
-    """Gain of some terms over others of them.
+) -> tuple[Gain, Array]:
+    """Gain of some terms over others of them, and the information (folds, P, P) on all outside each fold, the fit's own
+    freedom projected off.
 
     Parameters
     ----------
@@ -216,18 +216,6 @@ def gain_over(
     test_masks, train_masks: (folds, B) the blocks of each fold.
     before, after: (P,) terms of the two models compared.
     """
-    return _gain_and_known(g, freedom, test_masks, train_masks, before, after)[0]
-
-
-def _gain_and_known(
-    g: Grams,
-    freedom: int,
-    test_masks: NDArray[np.bool_],
-    train_masks: NDArray[np.bool_],
-    before: NDArray[np.bool_],
-    after: NDArray[np.bool_],
-) -> tuple[Gain, Array]:
-    """The same, and the information (folds, P, P) outside each fold, the fit's own freedom projected off."""
     train, test = g.chosen(train_masks), g.chosen(test_masks)
     n, y = normal(train)
     own = own_information(g)
