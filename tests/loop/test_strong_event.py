@@ -83,7 +83,10 @@ def test_it_is_named_and_the_calibration_is_as_good_as_without(
     vectors = np.array([c["value"] for c in adopted["coefficients"]]).reshape(-1, 3)
     assert vectors == pytest.approx(MAGNET[sensors], abs=0.5)
     error = found.verdict["error"]["held_out"]
-    assert error["before"]["total_field_rms_nT"]["all"] > 5000.0
+    if len(sensors) == 1:
+        assert error["before"]["total_field_rms_nT"]["all"] > 5000.0
+    else:
+        assert error["before"] is None  # no calibration without it brings the sensors to one field
     assert error["after"]["total_field_rms_nT"]["all"] < 0.2  # 0.15 nT of noise an axis, 0.1 nT of the base station's
     assert "calibration" not in found.verdict  # it is determined
     assert not found.verdict["unexplained"]["present"]
