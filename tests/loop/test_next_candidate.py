@@ -217,7 +217,7 @@ def test_a_step_is_no_part_of_a_drift_unless_it_is(rises: Any, part: str) -> Non
 
     def whole_of(*candidates: Candidate) -> str:
         lasting = rivals.part_of_a_drift(step, candidates, state)
-        assert lasting is None or lasting.of_an_event
+        assert lasting is None or not lasting.of_an_event  # it follows no channel
         return lasting.model.name if lasting else ""
 
     assert whole_of(*found) == part
@@ -244,7 +244,7 @@ def test_what_an_event_is_a_part_of_is_judged_where_that_was() -> None:
     assert event.passes and not doubtful.passes
     lasting = rivals.part_of_a_drift(event, [event, doubtful], state)
     assert lasting is not None and lasting.model.name == "current_field"
-    assert lasting.passes and lasting.assessment.parts is event.assessment.parts
+    assert lasting.of_an_event and lasting.passes and lasting.assessment.parts is event.assessment.parts
     assert lasting.assessment.gain.total > event.assessment.gain.total
 
 

@@ -46,7 +46,7 @@ class Candidate:
         before: what it was judged against, where that is the fit with it, its part put back (`own_fit`).
         moved: the place of an adopted model that takes other settings beside it, and that model with these (`split`);
             `terms` are of both then, the one that takes other settings first.
-        of_an_event: whether something that happened once, which passes, is a part of what it explains: it lasts.
+        of_an_event: whether something that happened once, which passes, is a part of what it explains with a channel.
     """
 
     model: Adopted

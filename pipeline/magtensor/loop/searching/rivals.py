@@ -154,7 +154,10 @@ def part_of_a_drift(candidate: Candidate, candidates: Sequence[Candidate], state
 
 
 def _judged_by_its_part(lasting: Candidate, event: Candidate, state: State) -> Candidate:
-    """What lasts, as it stands beside an event that passes and is a part of it: judged on the event's own folds."""
+    """What lasts and follows a channel, as it stands beside an event that passes and is a part of it: judged on the
+    event's own folds. Of a drift the event says no more than that something moved."""
+    if not lasting.model.channels(state.excitation):
+        return lasting
     found, parts, before = lasting.assessment, event.assessment.parts, lasting.before or state
     gain, null_gain = (fold_gain(before, c, lasting.terms, parts=parts) for c in (found.colours, before.colours))
     return replace(lasting, of_an_event=True, assessment=replace(found, parts=parts, gain=gain, null_gain=null_gain))
