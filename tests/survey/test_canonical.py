@@ -120,6 +120,21 @@ def test_a_channel_of_another_length_is_left_out_with_the_reason(tmp_path: Path)
 
 
 @pytest.mark.parametrize(
+    ("name", "values", "why"),
+    [
+        ("mode", np.array([b"hover", b"turn"] * 30), "text"),
+        ("serial", np.float64(17.0), "a single value"),
+        ("spectra", np.zeros((60, 5)), "shape (60, 5)"),
+        ("diurnal", np.zeros(60), "the name of a result"),
+    ],
+)
+def test_what_is_no_channel_is_left_out_with_the_reason(tmp_path: Path, name: str, values: Any, why: str) -> None:
+    survey = read_canonical(plain_file(tmp_path / "w.h5", **{name: ((), values, {})}))
+    assert f"left out: {name} ({why})" in " ".join(survey.attributes["notes"])
+    assert name not in survey
+
+
+@pytest.mark.parametrize(
     ("changes", "message"),
     [
         ({"b_raw": ((), None, {})}, "there is no dataset b_raw"),

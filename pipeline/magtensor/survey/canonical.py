@@ -95,7 +95,7 @@ def survey_from(tables: Tables) -> Survey:
             continue
         found = _variable(name, column, sizes, notes)
         if found is None:
-            ignored.append(name if column.shape[:1] in ((), (len(time),)) else f"{name} ({_rows(column, len(time))})")
+            ignored.append(f"{name} ({_why_left_out(name, column, len(time))})")
         else:
             variables[name] = found
     variables.update(_reference(tables, epoch, ignored))
@@ -107,8 +107,14 @@ def survey_from(tables: Tables) -> Survey:
     return Survey.build(variables, attributes)
 
 
-def _rows(column: Column, count: int) -> str:
-    return f"{column.shape[0]} rows, the survey has {count}"
+def _why_left_out(name: str, column: Column, count: int) -> str:
+    if column.shape[:1] not in ((), (count,)):
+        return f"{column.shape[0]} rows, the survey has {count}"
+    if column.text:
+        return "text"
+    if name in RESULTS:
+        return "the name of a result"
+    return f"shape {column.shape}" if column.shape else "a single value"
 
 
 def _groups(names: list[str]) -> list[str]:
