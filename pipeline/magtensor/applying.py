@@ -179,7 +179,6 @@ def apply_and_refine(
     from magtensor.calibration.surveys.corrections import with_scatter
     from magtensor.dated import at_date_of
     from magtensor.effect_errors import taken_off
-    from magtensor.loop.correcting.beyond import extrapolated
     from magtensor.loop.correcting.stored import (
         begun_anew,
         bridged,
@@ -217,7 +216,7 @@ def apply_and_refine(
         fitted = with_scatter(fitted, apart)
         adopted, theta, origins = stored_effects(calibration, planned.registry)
         adopted = on_its_clock(adopted, theta, origins, calibration, as_fitted(calibration, fitted), survey)
-        here = those_here(adopted, theta, origins, as_fitted(calibration, fitted), survey)
+        here = those_here(adopted, theta, origins, as_fitted(calibration, fitted), survey, calibration)
         adopted, theta = here.adopted, here.theta
         known = calibration.values("calibration/noise_std") if "calibration/noise_std" in calibration else None
         if judge and adopted:  # what an effect makes of the field beside a spike would be full of it
@@ -229,7 +228,7 @@ def apply_and_refine(
             survey = flagged(survey, fitted, known, uniform=uniform)
         words = {
             "not_taken_off": here.left_in,
-            "extrapolated": extrapolated(before, calibration, adopted, origins),
+            "extrapolated": "; ".join(f"{name}: {how}" for name, how in here.beyond.items()),
             "bridged": bridged(before, adopted),
             "begins_anew": begun_anew(adopted, calibration),
             "not_as_dated": not_as_dated(adopted, survey),
@@ -307,10 +306,10 @@ def verified(calibrated: Survey, path: Path | Held, planned: Plan) -> dict[str, 
 def verification(calibrated: Survey, path: Path | Held, planned: Plan) -> dict[str, Any]:
     """The error blocks of another survey: with the declared model alone, and with all that was adopted.
 
-    `total_field_as_read` names errors of the base station that were left in (`_better_as_read`), `contradicted` effects
-    without which |b| would be nearer to the survey's total field, `extrapolated` those that the survey takes beyond
-    what the calibration has seen, and `left_by_any_calibration_nT` is what of |b| - F no other calibration of the
-    sensors would take off.
+    `total_field_as_read` names errors of the base station that were left in (`_better_as_read`), `contradicted`
+    effects without which |b| would be nearer to the survey's total field, `extrapolated` those that the survey
+    takes beyond what the calibration has seen, `not_on_this_survey` those that its lengths refute, which were left
+    in, and `left_by_any_calibration_nT` is what of |b| - F no other calibration of the sensors would take off.
     """
     corrected = apply_to(calibrated, path, planned, uniform=True)
     after = survey_block(corrected)
@@ -323,7 +322,7 @@ def verification(calibrated: Survey, path: Path | Held, planned: Plan) -> dict[s
         each = corrected.values("calibrated/b"), corrected.values("total_field"), corrected.good_by_sensor
         found["left_by_any_calibration_nT"] = left_by_any_calibration(*each)
     attributes = corrected["calibrated/b"].attrs
-    told = ("not_taken_off", "total_field_as_read", "contradicted", "extrapolated")
+    told = ("not_taken_off", "not_on_this_survey", "total_field_as_read", "contradicted", "extrapolated")
     return found | {name: attributes[name] for name in told if name in attributes}
 
 

@@ -91,7 +91,8 @@ def sentence(outcome: dict[str, Any]) -> str:
         falls, held_out = _falls(before, after), outcome["error"].get("held_out") or {}
         shown_there = bool(held_out.get("after")) and _falls(held_out["before"], held_out["after"])
         absent = not _clearly_worse(before, after) and not _clearly_worse(held_out.get("after"), after, DISAGREES)
-        beyond = bool((outcome["error"].get("verify") or {}).get("extrapolated"))
+        verify = outcome["error"].get("verify") or {}
+        beyond = bool(verify.get("extrapolated") or verify.get("not_on_this_survey"))
         if not falls and shown_there and (absent or beyond):
             falls = True
             shown = _figures(held_out["before"], held_out["after"])
@@ -158,6 +159,8 @@ def _disagreement(outcome: dict[str, Any]) -> str:
         return ""
     if as_read := verify.get("total_field_as_read"):
         return f"; the verification survey's total field has no {as_read}: it is judged as it was read"
+    if refuted := verify.get("not_on_this_survey"):
+        return f"; NOT taken off the verification survey, for the lengths of its vectors refute it: {refuted}"
     contradicted = str(verify.get("contradicted", ""))
     key = "total_field_rms_nT"
     before, after, here = ((b or {}).get(key) or {} for b in (verify["before"], verify["after"], held_out["after"]))

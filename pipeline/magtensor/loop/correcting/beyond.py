@@ -28,49 +28,47 @@ def seen_here(record: Record, adopted: Sequence[Adopted]) -> dict[str, str]:
     return {"channel_ranges": json.dumps(ranges), "largest_outputs_nT": json.dumps(_largest(record).tolist())}
 
 
-def extrapolated(survey: Survey, calibration: Survey, adopted: Sequence[Adopted], origins: Mapping[str, Array]) -> str:
+def extrapolated(
+    survey: Survey, calibration: Survey, adopted: Sequence[Adopted], origins: Mapping[str, Array]
+) -> dict[str, str]:
     """Which effects go beyond what the calibration has seen, and how far: of a channel that they follow, or of the
-    field, with which they do not grow in proportion; "" where none does."""
+    field, with which they do not grow in proportion."""
     known = calibration["calibration/effects"].attrs if adopted else {}
     if "channel_ranges" not in known or not survey.good.any():
-        return ""
+        return {}
     record = record_of(survey, origins, use=survey.good)
     here = [a for a in adopted if a.component.effect != "site"]  # what belongs to a site is not taken off
-    words = [
-        *_of_channels(record, here, json.loads(str(known["channel_ranges"]))),
-        *_of_the_field(record, here, json.loads(str(known.get("largest_outputs_nT", "[]")))),
-    ]
-    return "; ".join(dict.fromkeys(words))
+    ranges, largest = (json.loads(str(known.get(of, "[]"))) for of in ("channel_ranges", "largest_outputs_nT"))
+    found: dict[str, list[str]] = {}
+    for effect in here:
+        if words := [*_of_channels(record, effect, ranges), *_of_the_field(record, effect, largest)]:
+            found.setdefault(effect.name, []).extend(words)
+    return {name: "; ".join(dict.fromkeys(words)) for name, words in found.items()}
 
 
-def _of_channels(record: Record, adopted: Sequence[Adopted], seen: Mapping[str, Sequence[float]]) -> list[str]:
+def _of_channels(record: Record, effect: Adopted, seen: Mapping[str, Sequence[float]]) -> list[str]:
     words = []
-    for effect in adopted:
-        for what, channel, values in _followed(effect, record):
-            if what not in seen:  # of 2026: channels alone
-                what, values = channel, record.logged[channel]
-            if what not in seen:
-                continue
-            low, high = seen[what]
-            beyond = max(low - float(values.min()), float(values.max()) - high)
-            if beyond > MOST_BEYOND * (high - low):
-                units = f" {record.units[channel]}" if record.units[channel] else ""
-                words.append(f"{effect.name}: {what} goes {beyond:.3g}{units} beyond what the calibration has seen")
+    for what, channel, values in _followed(effect, record):
+        if what not in seen:  # of 2026: channels alone
+            what, values = channel, record.logged[channel]
+        if what not in seen:
+            continue
+        low, high = seen[what]
+        beyond = max(low - float(values.min()), float(values.max()) - high)
+        if beyond > MOST_BEYOND * (high - low):
+            units = f" {record.units[channel]}" if record.units[channel] else ""
+            words.append(f"{what} goes {beyond:.3g}{units} beyond what the calibration has seen")
     return words
 
 
-def _of_the_field(record: Record, adopted: Sequence[Adopted], seen: Sequence[float]) -> list[str]:
+def _of_the_field(record: Record, effect: Adopted, seen: Sequence[float]) -> list[str]:
     largest = _largest(record)
     if len(seen) != len(largest):  # of 2026: none
         return []
     times = float(np.max(largest / np.asarray(seen)))
-    if times <= 1.0 + MOST_BEYOND:
+    if times <= 1.0 + MOST_BEYOND or not _bent(effect, record):
         return []
-    return [
-        f"{effect.name}: the outputs are {times:.3g} times as large as any that the calibration has seen"
-        for effect in adopted
-        if _bent(effect, record)
-    ]
+    return [f"the outputs are {times:.3g} times as large as any that the calibration has seen"]
 
 
 def _largest(record: Record) -> Array:

@@ -21,25 +21,29 @@ AVERAGING = "averaging"
 HALF = 0.5  # of what the effect takes off the lengths: below it the survey is nearer to having none
 
 
-def averaged_otherwise(
+def refuted(
+    name: str,
     record: Record,
     calibration: ArrayCalibration,
     adopted: Sequence[Adopted],
     theta: Sequence[Array],
     good: NDArray[np.bool_],
 ) -> bool:
-    """Whether the lengths of a survey's outputs refute the `averaging` of a calibration.
+    """Whether the lengths of a survey's outputs refute an effect of a calibration.
 
-    A survey that turns too slowly, or crosses too strong a field, to tell is taken to be recorded as the calibration's.
+    A survey whose lengths cannot tell has what the calibration's has: for `averaging` one that turns too slowly, or
+    crosses too strong a field.
 
     Parameters
     ----------
-    record: all samples of the survey, channels with the calibration's origins taken off.
-    adopted: the effects, `averaging` among them; theta: their coefficients; good: (N,) the samples that count.
+    name: of the effect.
+    record: all samples of the survey, channels with the calibration's origins taken off, the total field without the
+        base station's errors.
+    adopted: the effects; theta: their coefficients; good: (N,) the samples that count.
     """
-    number = next(i for i, a in enumerate(adopted) if a.name == AVERAGING)
     b = calibration.apply(corrected_raw(record, calibration, adopted, theta, good))
-    return _refuted(record, calibration, adopted, theta, good, number, b)
+    numbers = [i for i, a in enumerate(adopted) if a.name == name]
+    return any(_refuted(record, calibration, adopted, theta, good, i, b) for i in numbers)
 
 
 def contradicted(
@@ -55,8 +59,7 @@ def contradicted(
 
     Parameters
     ----------
-    record: all samples of the survey, as read but for its total field, which is without the base station's errors.
-    b: (N, S, 3) nT, with all effects taken off; the others as for `averaged_otherwise`.
+    b: (N, S, 3) nT, with all effects taken off; the others as for `refuted`.
     """
     own = [i for i, a in enumerate(adopted) if a.component.effect == "instrument"]
     return [adopted[i].name for i in own if _refuted(record, calibration, adopted, theta, good, i, b)]

@@ -17,10 +17,10 @@ from magtensor.error_models.settings import NOT_KNOWN, AnyChannel, Beginning, Du
 from magtensor.error_models.waveform import NAME
 from magtensor.errors import DataError, UsageError
 from magtensor.loop.correcting.another_survey import TONE, WARM_UP, shows_a_state, unknown
-from magtensor.loop.correcting.beyond import seen_here
+from magtensor.loop.correcting.beyond import extrapolated, seen_here
 from magtensor.loop.correcting.correction import corrected_raw, corrected_reference, hidden_objection
 from magtensor.loop.correcting.dates import LONG, as_dated_here
-from magtensor.loop.correcting.lengths import AVERAGING, averaged_otherwise, contradicted
+from magtensor.loop.correcting.lengths import AVERAGING, contradicted, refuted
 from magtensor.loop.fitting.model import Adopted, Record, unread
 from magtensor.loop.fitting.record import channels_of, record_of
 from magtensor.registry import Registry
@@ -152,12 +152,14 @@ class Here:
     """The effects of a calibration that another survey lets be taken off, with their coefficients.
 
     Attributes:
-        refuted: the name of what its own lengths refute; "" where nothing is.
+        beyond: of each that goes beyond what the calibration has seen, how far.
+        refuted: what its own lengths refute; "" where nothing is.
         left_in: what it may have and does not let be taken off, and why; "" where there is nothing.
     """
 
     adopted: list[Adopted]
     theta: list[Array]
+    beyond: dict[str, str]
     refuted: str
     left_in: str
 
@@ -168,19 +170,32 @@ def those_here(
     origins: Mapping[str, Array],
     fitted: ArrayCalibration,
     survey: Survey,
+    calibration: Survey,
 ) -> Here:
     """The effects that another survey has too.
 
-    Rows that are averages belong to the way a survey was recorded, which its lengths may refute. A source that nobody
-    logged cannot be told from a field that bends within the array, nor where nearly all of it could be a gradient.
+    Its lengths may refute two kinds: rows that are averages belong to the way a survey was recorded; and what an effect
+    does beyond what the calibration has seen nobody knows. A source that nobody logged cannot be told from a field that
+    bends within the array, nor where nearly all of it could be a gradient.
+
+    Args:
+        fitted: as the survey is corrected with; calibration: as it is stored.
     """
-    here = Here(list(adopted), list(theta), "", left_in(survey, adopted))
-    asked = {AVERAGING, NAME} & {a.name for a in adopted}
+    beyond = extrapolated(survey, calibration, adopted, origins)
+    here = Here(list(adopted), list(theta), beyond, "", left_in(survey, adopted))
+    if "total_field" not in survey:
+        beyond = {}  # lengths alone change with the field
+    asked = {AVERAGING, NAME, *beyond} & {a.name for a in adopted}
     record = record_of(survey, origins=origins, every=True) if asked else None
     if record is None or any(a.component.effect != "site" and _lacking(a, record) for a in adopted):
         return here  # what it lacks is told when the effects are taken off
-    if AVERAGING in asked and averaged_otherwise(record, fitted, adopted, theta, survey.good):
-        here = _without(here, AVERAGING, refuted=AVERAGING)
+    record = replace(record, total_field=corrected_reference(record, adopted, theta))
+    own = dict.fromkeys(a.name for a in adopted if a.component.effect == "instrument")
+    for name in own:
+        asked_here = name == AVERAGING or name in beyond
+        if asked_here and refuted(name, record, fitted, here.adopted, here.theta, survey.good):
+            why = f"{name} ({beyond[name]})" if name in beyond else name
+            here = _without(here, name, refuted="; ".join(w for w in (here.refuted, why) if w))
     if NAME in asked and (why := hidden_objection(record, fitted, here.adopted, here.theta, survey.good)):
         words = f"{NAME}: {why}"
         here = _without(here, NAME, left_in="; ".join(w for w in (here.left_in, words) if w))
@@ -189,7 +204,9 @@ def those_here(
 
 def _without(here: Here, name: str, **words: str) -> Here:
     kept = [i for i, a in enumerate(here.adopted) if a.name != name]
-    return replace(here, adopted=[here.adopted[i] for i in kept], theta=[here.theta[i] for i in kept], **words)
+    adopted, theta = [here.adopted[i] for i in kept], [here.theta[i] for i in kept]
+    beyond = {effect: how for effect, how in here.beyond.items() if effect != name}
+    return replace(here, adopted=adopted, theta=theta, beyond=beyond, **words)
 
 
 def contradicted_here(
