@@ -8,7 +8,7 @@ from pydantic import Field
 from magtensor.calibration.types import Array
 from magtensor.components import error_model
 from magtensor.error_models.excitation import Excitation
-from magtensor.error_models.settings import Range
+from magtensor.error_models.settings import Orders, Range
 from magtensor.error_models.terms import Terms, joined
 from magtensor_effects.forms import OfField
 
@@ -77,17 +77,25 @@ def hysteresis(
         Range(300.0, 30000.0, count=6, spacing="log"),
         Field(gt=0, description="half width of the play: how far the field turns back before the output follows, nT"),
     ] = 5000.0,
+    of_iron: Annotated[
+        bool,
+        Orders((False, True)),
+        Field(description="true: iron beside the sensor, whose field reaches all axes; false: each axis by itself"),
+    ] = False,
 ) -> Terms:
-    """Part of each axis's output hangs behind like gears with play.
+    """Part of each axis's output, or of what iron beside the sensor adds to it, hangs behind like gears with play.
 
     (P_r(m) - m) / r with the play operator P_r run along all samples, and along the points between them at which the
-    output turns back; the coefficient is half the opening of the loop. It starts without play at the first sample and
-    keeps its state across gaps. Rivals: `sampling_lag` and `eddy_current` for swings of equal amplitude and rate.
+    output turns back; the coefficient is half the opening of the loop. The magnetisation of iron along one axis shows
+    in all three: nine coefficients a sensor then, through a matrix. It starts without play at the first sample and
+    keeps its state across gaps. Rivals: `sampling_lag` and `eddy_current` for swings of equal amplitude and rate, and
+    `viscous_magnetisation` for iron.
     """
     m = x.output.reshape(len(x.time), -1)
     course = x.with_turning_points.reshape(-1, m.shape[1])
     hanging = (_play(course, half_width_nT)[::2] - m) / half_width_nT
-    return x.responses(hanging.reshape(x.output.shape), "nT")
+    hanging = hanging.reshape(x.output.shape)
+    return x.matrices(hanging, "nT") if of_iron else x.responses(hanging, "nT")
 
 
 def _play(u: Array, half_width: float) -> Array:

@@ -162,6 +162,17 @@ def test_one_play_operator_takes_most_of_two() -> None:
     assert fitted("hysteresis", {"half_width_nT": 7000.0}, effect)[0].left < 0.2
 
 
+def test_play_of_iron_reaches_all_axes() -> None:
+    # the iron's axes are the platform's, those of the play the sensor's own: up to a degree apart
+    coupling = (1e-3 * np.random.default_rng(6).standard_normal((4, 3, 3))).tolist()
+    effect, settings = {"coupling": coupling, "half_width_nT": [5000.0]}, {"half_width_nT": 5000.0}
+    iron = {"simulated_as": "iron_hysteresis", "after_s": START_S}
+    fit, survey, _ = fitted("hysteresis", settings | {"of_iron": True}, effect, **iron)
+    assert fit.left < 0.05
+    np.testing.assert_allclose(per_matrix(fit, survey.sensors) / 5000.0, coupling, atol=2e-4)
+    assert fitted("hysteresis", settings, effect, **iron)[0].left > 0.5
+
+
 def test_sampling_lag_of_whole_sensors_needs_one_coefficient_each() -> None:
     lag = [[a, a, a] for a in (1e-3, -2e-3, 0.5e-3, 3e-3)]
     fit, survey, _ = fitted("sampling_lag", {}, {"lag_s": lag})

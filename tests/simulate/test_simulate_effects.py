@@ -34,6 +34,7 @@ EVERY: dict[str, dict[str, Any]] = {
     "nonlinearity_cubic": {},
     "cross_field": {},
     "hysteresis": {"half_width_nT": [2000.0, 8000.0]},
+    "iron_hysteresis": {"half_width_nT": [2000.0, 8000.0]},
     "offset_step": {"time_s": [20.0, 45.0]},
     "scale_step": {"time_s": [20.0, 45.0]},
     "turn_step": {"time_s": 20.0},

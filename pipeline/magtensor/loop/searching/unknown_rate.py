@@ -21,7 +21,7 @@ from magtensor.error_models.terms import Terms, joined
 from magtensor.loop.evidence.assessment import estimated_in, explained
 from magtensor.loop.evidence.grams import Whitened
 from magtensor.loop.fitting.model import State
-from magtensor.loop.fitting.separation import fold_gain, separated
+from magtensor.loop.fitting.separation import SEPARATION, fold_gain, separated
 from magtensor.loop.searching.gates import Candidate
 from magtensor.loop.searching.profiling import settings_grid, terms_of
 
@@ -85,7 +85,8 @@ def _quicker(chosen: Candidate, state: State, models: Sequence[Component]) -> st
         quick, own = (fold_gain(state, colours, each) for each in (terms, chosen.terms))
         spare = max(terms.count - chosen.terms.count, 0)
         same = model.name == chosen.model.name
-        if not (separated(quick, own, spare) or (same and not separated(own, quick))):
+        ahead = quick.over(own).total >= SEPARATION + spare  # in sum: a name has to stand in every fold, a doubt not
+        if not (ahead or (same and not separated(own, quick))):
             continue
         if not separated(fold_gain(state, colours, terms, chosen.terms), quick):
             return model.name

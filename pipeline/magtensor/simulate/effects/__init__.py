@@ -25,6 +25,7 @@ from magtensor.simulate.effects.platform import (
     CurrentField,
     EddyCurrent,
     FrameFlexure,
+    IronHysteresis,
     LatentSource,
     MovingPart,
     PeriodicInterference,
@@ -66,6 +67,7 @@ AnyEffect = Annotated[
     | Crosstalk
     | EddyCurrent
     | ViscousMagnetisation
+    | IronHysteresis
     | FrameFlexure
     | NonlinearityQuadratic
     | NonlinearityCubic

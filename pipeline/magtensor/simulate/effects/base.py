@@ -9,7 +9,7 @@ that the effect has the rms asked for.
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Literal
 
@@ -20,11 +20,12 @@ from magtensor.errors import UsageError, did_you_mean
 from magtensor.simulate.channels import Channel
 from magtensor.simulate.field import FieldModel
 from magtensor.simulate.instrument import Instrument
-from magtensor.simulate.processes import low_pass
+from magtensor.simulate.processes import low_pass, play
 from magtensor.simulate.rotations import transform
 from magtensor.simulate.spec import Array, Spec, per_sensor, stream
 
 CHUNK = 1 << 15  # samples evaluated at once: bounds the memory, has no influence on the result
+SUBSTEPS = 4  # steps per sample interval between which a hysteresis loop is followed
 
 Kind = Literal["instrument", "site", "reference"]
 
@@ -91,6 +92,22 @@ class Bench:
         """x (N, S, 3) nT of tau x' + x = b; in a uniform field (N, 1, 3)."""
         places = self.instrument.positions if self.field.sources else self.instrument.positions[:1]
         return low_pass(lambda t: self.field.at(t, places), self.time, tau_s, chunk=self.chunk)
+
+    def left_behind(self, half_widths: Sequence[float], seen: Callable[[Array], Array]) -> Array:
+        """(N, S, 3) nT: the mean of P_r(u) - u with the play operators P_r of these half widths, nT, followed between
+        the samples too. `seen` makes of the field (n, S, 3) what moves them."""
+        out = np.zeros(self.b.shape)
+        states: list[Array | None] = [None] * len(half_widths)
+        step = 1 / (self.rate_Hz * SUBSTEPS)
+        for piece in self.pieces():
+            count = piece.stop - piece.start
+            fine = self.time[0] + (piece.start * SUBSTEPS + np.arange(count * SUBSTEPS)) * step
+            u = seen(self.field.at(fine, self.instrument.positions)).reshape(len(fine), -1)
+            for i, half_width in enumerate(half_widths):
+                followed = play(u, half_width, states[i])
+                states[i] = followed[-1].copy()
+                out[piece] += (followed - u)[::SUBSTEPS].reshape(count, self.sensors, 3)
+        return out / len(half_widths)
 
     def channel(self, name: str, effect: str) -> Array:
         """(N, S): true values of a channel at each sensor.

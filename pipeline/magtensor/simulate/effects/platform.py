@@ -227,6 +227,28 @@ class ViscousMagnetisation(SensorEffectSpec):
         return bench.sensed(_coupled(bench, coefficients, bench.lagged_field(self.tau_s)))
 
 
+class IronHysteresis(SensorEffectSpec):
+    """Iron whose magnetisation hangs behind the field like gears with play: K times the mean of P_r(b) - b, the play
+    operators along the platform's axes."""
+
+    COEFFICIENTS = "coupling"
+    DYNAMIC = True
+    type: Literal["iron_hysteresis"]
+    coupling: list[Matrix3] | None = Field(None, description="K of each sensor, without dimension")
+    half_width_nT: list[float] = Field(
+        default=[5000.0], min_length=1, description="half widths r of the play operators, nT"
+    )
+
+    def drawn(self, bench: Bench, rng: np.random.Generator) -> Array:
+        return rng.standard_normal((bench.sensors, 3, 3))
+
+    def read(self, bench: Bench) -> Array:
+        return _matrices(self.given, bench.sensors, "effect iron_hysteresis: coupling")
+
+    def waveform(self, bench: Bench, coefficients: Array) -> Array:
+        return bench.sensed(_coupled(bench, coefficients, bench.left_behind(self.half_width_nT, lambda b: b)))
+
+
 class FrameFlexure(SensorEffectSpec):
     """The frame bends under gravity and acceleration, and turns each sensor by a small angle."""
 

@@ -8,11 +8,9 @@ import numpy as np
 from pydantic import Field
 
 from magtensor.simulate.effects.base import Bench, SensorEffectSpec
-from magtensor.simulate.processes import low_pass, play
+from magtensor.simulate.processes import low_pass
 from magtensor.simulate.rotations import transform
 from magtensor.simulate.spec import Array, PerSensor
-
-SUBSTEPS = 4  # steps per sample interval between which a hysteresis loop is followed
 
 
 class NonlinearityQuadratic(SensorEffectSpec):
@@ -74,19 +72,8 @@ class Hysteresis(SensorEffectSpec):
     )
 
     def waveform(self, bench: Bench, coefficients: Array) -> Array:
-        added = np.zeros(bench.b.shape)
-        states: list[Array | None] = [None] * len(self.half_width_nT)
-        step = 1 / (bench.rate_Hz * SUBSTEPS)
-        for piece in bench.pieces():
-            count = piece.stop - piece.start
-            fine = bench.time[0] + (piece.start * SUBSTEPS + np.arange(count * SUBSTEPS)) * step
-            b = bench.field.at(fine, bench.instrument.positions)
-            m = (transform(bench.instrument.matrix, b) + bench.instrument.offset).reshape(len(fine), -1)
-            for i, half_width in enumerate(self.half_width_nT):
-                followed = play(m, half_width, states[i])
-                states[i] = followed[-1].copy()
-                added[piece] += (followed - m)[::SUBSTEPS].reshape(count, bench.sensors, 3)
-        return added * (coefficients / len(self.half_width_nT))
+        matrix, offset = bench.instrument.matrix, bench.instrument.offset
+        return coefficients * bench.left_behind(self.half_width_nT, lambda b: transform(matrix, b) + offset)
 
 
 class Bandwidth(SensorEffectSpec):
