@@ -79,6 +79,7 @@ RIGHT: dict[str, dict[str, Any]] = {
     "calibration_step": {"time_s": 1000.0},
     "temperature_alignment": {"channel": "temperature"},
     "alignment_drift": {"tau_s": 600.0},
+    "channel_alignment": {"channel": "pressure", "lag_s": 3.0},
     "sampling_lag": {"per_axis": True},
     "lag_step": {"time_s": 900.0},
     "viscous_magnetisation": {"tau_s": 20.0},

@@ -133,7 +133,7 @@ def _clearly_worse(before: dict[str, Any] | None, after: dict[str, Any], times: 
 
 
 def _named(adopted: Sequence[Mapping[str, Any]]) -> list[str]:
-    """The error models, with the channel of a response to any, and how often where more than once."""
+    """The error models, with the channel of those that follow any, and how often where more than once."""
     names = [_with_its_channel(a) for a in adopted]
     return [f"{count} x {name}" if count > 1 else name for name, count in Counter(names).items()]
 
@@ -141,7 +141,7 @@ def _named(adopted: Sequence[Mapping[str, Any]]) -> list[str]:
 def _with_its_channel(a: Mapping[str, Any]) -> str:
     name, settings = str(a["error_model"]), a.get("settings", {})
     channel, others = settings.get("channel"), a.get("channels_as_good", [])
-    if channel and (name == "channel_response" or others):
+    if channel and (name.startswith("channel_") or others):
         name = f"{name} of {channel}" + (f" (or of {' or '.join(others)})" if others else "")
     if like := a.get("most_like_channel"):
         name = f"{name} (most like channel {like})"

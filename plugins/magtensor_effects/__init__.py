@@ -23,6 +23,7 @@ from magtensor_effects.inertia import (
 from magtensor_effects.latent import latent_source
 from magtensor_effects.mechanics import (
     alignment_drift,
+    channel_alignment,
     crosstalk,
     frame_flexure,
     temperature_alignment,
@@ -40,6 +41,7 @@ __all__ = [
     "bandwidth",
     "baseline_expansion",
     "calibration_step",
+    "channel_alignment",
     "channel_response",
     "clock_drift",
     "cross_field",

@@ -10,15 +10,17 @@ from magtensor.calibration.types import Array
 from magtensor.components import error_model
 from magtensor.error_models.acting import AXES
 from magtensor.error_models.excitation import Excitation
-from magtensor.error_models.settings import LagsOf, Orders, Range
+from magtensor.error_models.settings import AnyChannel, LagsOf, Orders, Range
 from magtensor.error_models.terms import Terms, joined
 from magtensor.units import GRAVITY
 from magtensor_effects.ageing import EventTime, Span
-from magtensor_effects.forms import AtStart, Delayed
+from magtensor_effects.channels import ATTITUDE_ANGLES
+from magtensor_effects.forms import AtStart, Delayed, Smooth
 from magtensor_effects.temperature import THERMOMETER, ThermalLag, Thermometer
 
 ARCMIN = np.pi / (180.0 * 60.0)
 UP = np.array([0.0, 0.0, 1.0])
+LOAD = AnyChannel("*", without=("temperature*", *ATTITUDE_ANGLES), but_units="degC", vectors=False)
 
 Angles = Annotated[
     int,
@@ -108,6 +110,39 @@ def temperature_alignment(
     """
     name = THERMOMETER.pick(x, channel)
     course = x.thermometer(name, lag_s, delayed, at_start)
+    return joined(_by_an_arcmin(x, course, f"arcmin/{x.units[name]}", angles))
+
+
+@error_model(
+    "instrument",
+    source="small rotation in proportion to a load",
+    typical="a boom under load, a hull under pressure: 1 arcmin is 14.5 nT in 50 000 nT",
+    pointwise=True,
+)
+def channel_alignment(
+    x: Excitation,
+    *,
+    channel: Annotated[
+        str,
+        LOAD,
+        Field(description="any logged channel with one component but temperatures and angles; '': the only one"),
+    ] = "",
+    lag_s: Annotated[
+        float,
+        Range(0.0, 300.0, count=4, spacing="log"),
+        Field(ge=0, description="time constant of a frame that gives way late, s"),
+    ] = 0.0,
+    smooth: Smooth = False,
+    angles: Angles = 3,
+) -> Terms:
+    """Each sensor's axes turn as a logged channel changes: a load, a pressure, a tension that bends what holds it.
+
+    As `temperature_alignment`, of any other channel, through a first-order lag. A load that nobody logs shows as a
+    matrix that changes with time. Rivals: `temperature_alignment` where the temperature goes with the channel,
+    `alignment_drift` where it rises steadily, `channel_response` where few attitudes are seen.
+    """
+    name = LOAD.pick(x, channel)
+    course = x.channel(name, lag_s, smooth=smooth)
     return joined(_by_an_arcmin(x, course, f"arcmin/{x.units[name]}", angles))
 
 

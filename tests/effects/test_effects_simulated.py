@@ -30,6 +30,7 @@ import magtensor_effects
 from magtensor.components import Component, component_of
 from magtensor.error_models.excitation import Excitation
 from magtensor.simulate.run import Simulated
+from magtensor_effects.mechanics import LOAD
 
 SPAN_S = 179.9  # of the tumbling survey
 START_S = 1.0  # the simulator begins at rest: rates are not the steady motion's before
@@ -299,6 +300,22 @@ def test_a_mount_that_turns_as_it_warms_in_arcmin_per_degree() -> None:
     fit, survey, _ = fitted("temperature_alignment", {"lag_s": 40.0}, effect)
     assert fit.left < 0.01
     np.testing.assert_allclose(per_axis(fit, survey.sensors), truth_of(survey), atol=0.03)
+
+
+def test_a_boom_that_bends_under_load_in_arcmin_per_unit() -> None:
+    effect = {"arcmin_per_unit": drawn(2), "channel": "pressure", "lag_s": 3.0}
+    fit, survey, x = fitted("channel_alignment", {"channel": "pressure", "lag_s": 3.0}, effect)
+    assert fit.left < 0.01
+    np.testing.assert_allclose(per_axis(fit, survey.sensors), truth_of(survey), atol=0.03)
+    assert set(magtensor_effects.channel_alignment(x, channel="pressure").units) == {"arcmin/hPa"}
+
+
+def test_a_boom_bends_under_any_channel_but_temperatures_and_angles() -> None:
+    x = excitation(simulated("temperature_offset", nT_per_degC=[0.0, 0.0, 0.0]))
+    course = np.linspace(0.0, 1.0, len(x.time))
+    named = {"winch_load": "kN", "heading": "deg", "temperature_1": "degC", "board": "K", "strain": "", "force": "N"}
+    logged = {name: np.repeat(course[:, None], 3, axis=1) if name == "force" else course for name in named}
+    assert LOAD.values(replace(x, logged=logged, units=named)) == ["strain", "winch_load"]
 
 
 def test_a_mount_that_creeps_in_arcmin() -> None:

@@ -41,6 +41,7 @@ EVERY: dict[str, dict[str, Any]] = {
     "calibration_step": {"time_s": 20.0},
     "temperature_alignment": {"lag_s": 5.0},
     "alignment_drift": {"tau_s": 20.0},
+    "channel_alignment": {"channel": "pressure", "lag_s": 5.0},
     "sampling_lag": {"per_axis": True},
     "lag_step": {"time_s": 20.0},
     "averaging": {},

@@ -116,12 +116,14 @@ class AnyChannel:
         pattern: for the names.
         without: patterns for names that are left out.
         or_units: channels in units of this dimension fit whatever their name.
+        but_units: channels in units of this dimension do not.
         vectors: channels with a value for each axis fit too.
     """
 
     pattern: str
     without: tuple[str, ...] = ()
     or_units: str = ""
+    but_units: str = ""
     vectors: bool = True
 
     def values(self, x: Excitation) -> list[Any]:
@@ -129,6 +131,8 @@ class AnyChannel:
         found = set(x.channels_like(self.pattern, self.without))
         if self.or_units:
             found |= {n for n in x.channels_like("*", self.without) if _alike(x.units.get(n, ""), self.or_units)}
+        if self.but_units:
+            found = {n for n in found if not _alike(x.units.get(n, ""), self.but_units)}
         return sorted(n for n in found if self.vectors or not x.is_vector(n))
 
     def pick(self, x: Excitation, name: str) -> str:

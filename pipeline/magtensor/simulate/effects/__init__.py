@@ -20,6 +20,7 @@ from magtensor.simulate.effects.geometry import BaselineExpansion, PositionError
 from magtensor.simulate.effects.platform import (
     AlignmentDrift,
     CalibrationStep,
+    ChannelAlignment,
     ChannelResponse,
     Crosstalk,
     CurrentField,
@@ -57,6 +58,7 @@ AnyEffect = Annotated[
     | CalibrationStep
     | TemperatureAlignment
     | AlignmentDrift
+    | ChannelAlignment
     | SupplyScale
     | SupplyOffset
     | CurrentField

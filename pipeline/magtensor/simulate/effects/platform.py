@@ -325,6 +325,26 @@ class TemperatureAlignment(LaggingTemperature):
         return _turned_by(bench, ARCMIN * coefficients, self.change(bench))
 
 
+class ChannelAlignment(SensorEffectSpec):
+    """The sensors turn as what holds them is loaded."""
+
+    COEFFICIENTS = "arcmin_per_unit"
+    LINEAR = False
+    type: Literal["channel_alignment"]
+    arcmin_per_unit: PerSensor | None = Field(
+        None, description="rotation vector in the platform frame, x, y, z, for all sensors or for each"
+    )
+    channel: str = Field(description="channel of the load")
+    lag_s: float = Field(0.0, ge=0, description="time constant of what gives way, s")
+    reference: float | None = Field(None, description="load at which it is nil; null: the survey's mean")
+
+    def waveform(self, bench: Bench, coefficients: Array) -> Array:
+        load = bench.lagged_channel(self.channel, self.lag_s, self.name)
+        return _turned_by(
+            bench, ARCMIN * coefficients, load - (load.mean() if self.reference is None else self.reference)
+        )
+
+
 class AlignmentDrift(SensorEffectSpec):
     """The sensors turn slowly in their mounts and come to rest."""
 
