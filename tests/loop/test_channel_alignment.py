@@ -1,4 +1,4 @@
-"""A sensor that turns as a load bends what holds it: told apart from what turns with time, and named with its channel."""
+"""A sensor that turns as a load bends what holds it: told apart from what turns with time, and named with the load."""
 
 from __future__ import annotations
 
