@@ -21,12 +21,15 @@ from magtensor.loop.searching.contribution import (
     slices,
 )
 from magtensor.loop.searching.gates import SECOND_ORDER
+from magtensor.loop.searching.overheard import shown_by_one
 
 
 def on_those_needed(record: Record, state: State, which: int, how: Fitting) -> State:
     """Refit with one of the models on those of its sensors that need it."""
     sensors = _needed(state, which)
-    return _on_a_few(record, state, which, how) if sensors is None else narrowed(record, state, which, sensors, how)
+    state = _on_a_few(record, state, which, how) if sensors is None else narrowed(record, state, which, sensors, how)
+    loudest = shown_by_one(record, state, which, how)
+    return narrowed(record, state, which, (loudest,), how) if loudest else state
 
 
 def _on_a_few(record: Record, state: State, which: int, how: Fitting) -> State:
