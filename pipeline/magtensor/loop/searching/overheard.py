@@ -76,7 +76,9 @@ def _square(state: State, numbers: Sequence[int], theta: Array) -> float:
 def _without(record: Record, state: State, sensor: str, how: Fitting) -> tuple[State, dict[int, int]] | None:
     """The fit to all other sensors, and where each model is in it that acts on others; None where there is no fit."""
     keep = [i for i, name in enumerate(record.sensors) if name != sensor]
-    models, theta, place = [], [], {}
+    models: list[Adopted] = []
+    theta: list[Array] = []
+    place: dict[int, int] = {}
     for number, model in enumerate(state.adopted):
         sensors = tuple(s for s in model.sensors if s != sensor)
         if model.sensors and not sensors:
