@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import h5py
@@ -41,6 +42,33 @@ def test_the_delay_is_found_and_the_lag_is_the_delay(
     assert delay["value"] == pytest.approx(delay_s, abs=max(4 * delay["std"], 0.03 * abs(delay_s)))
     assert found["settings"]["lag_s"] == pytest.approx(delay["value"], rel=0.15)
     assert not told["unexplained"]["present"], told["unexplained"]["description"]  # nor where no reading serves
+
+
+@pytest.mark.parametrize("delay_s", [12.0, pytest.param(-40.0, marks=pytest.mark.long)])
+def test_nothing_is_adopted_for_what_happens_where_there_is_no_reading(tmp_path: Path, delay_s: float) -> None:
+    """The station's record was cut by its own stamps to the time of the survey: of a delay nobody knows the field at
+    one end of it."""
+
+    def late(path: Path) -> None:
+        with h5py.File(path, "a") as file:
+            stamps = file["reference/time"][:] + delay_s
+            inside = (stamps >= 0.0) & (stamps <= file["time"][-1])
+            kept = {name: file[f"reference/{name}"][:][inside] for name in ("total_field",)} | {"time": stamps[inside]}
+            for name, values in kept.items():
+                attributes = dict(file[f"reference/{name}"].attrs)
+                del file[f"reference/{name}"]
+                file[f"reference/{name}"] = values
+                file[f"reference/{name}"].attrs["units"] = attributes["units"]
+
+    survey = scenario(46)
+    survey["base_station"] |= {"first_s": 0.0, "last_s": survey["motion"]["duration_s"]}
+    survey["field"] = survey["field"] | {"variation": {"irregular": {"rms_nT": 20.0, "time_s": 120.0}}}
+    told = verdict_of(tmp_path, survey, late, ["reference_clock", "reference_step", "offset_step", "passing_source"])
+    assert [a["error_model"] for a in told["adopted"]] == ["reference_clock"]
+    assert not told["unexplained"]["present"], told["unexplained"]["description"]
+    unread = re.search(r"its stamps corrected, has no reading at (\d+) samples", told["unexplained"]["description"])
+    assert unread is not None
+    assert int(unread[1]) / survey["rate_Hz"] == pytest.approx(abs(delay_s), abs=8.0)  # read every 2 s
 
 
 def test_slow_noise_of_the_base_station_is_no_delay(tmp_path: Path) -> None:

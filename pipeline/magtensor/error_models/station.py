@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from magtensor.between_readings import Course, course
 from magtensor.calibration.types import Array
@@ -38,6 +39,12 @@ class Station:
     def step_s(self) -> float:
         """Median time between its readings."""
         return float(np.median(np.diff(self.time)))
+
+    def known(self, time: Array) -> NDArray[np.bool_]:
+        """(N,) at which of the times (N,) s the field is: not before the second reading nor after the last but one, for
+        at an end of what was read its noise is hard to tell from its course."""
+        begin, end = (self.time[1], self.time[-2]) if len(self.time) > 3 else (self.time[0], self.time[-1])
+        return (time >= begin) & (time <= end)
 
     def reach(self, time: Array) -> float:
         """The share of the times (N,) s between the first and the last reading."""

@@ -215,11 +215,19 @@ def as_declared(chosen: Iterable[tuple[Component, Mapping[str, Any]]], time: Arr
     return models
 
 
-def unread(adopted: Sequence[Adopted], time: Array) -> NDArray[np.bool_]:
-    """(N,) samples at whose times (N,) s a channel that an adopted model follows had not been read yet, its log being
-    late: the model goes on as well as it can."""
+def unread(adopted: Sequence[Adopted], time: Array, station: Station | None = None) -> NDArray[np.bool_]:
+    """(N,) samples at whose times (N,) s nothing is known of what an adopted model follows.
+
+    A channel had not been read yet, its log being late: the model goes on as well as it can. Or the stamps of a base
+    station are late or early, and the field is not known at them as they are or as they should be.
+    """
     late = max((model.late_s for model in adopted), default=0.0)
-    return time + late > time[-1] if late else np.zeros(len(time), dtype=bool)
+    out = time + late > time[-1] if late else np.zeros(len(time), dtype=bool)
+    for model in adopted:
+        lag = float(model.settings.get("lag_s", 0.0)) if model.component.effect == "reference" else 0.0
+        if station is not None and lag:
+            out |= ~(station.known(time) & station.known(time + lag))
+    return out
 
 
 CHANNEL = "channel_response"  # of a channel that nobody wrote a model for

@@ -225,7 +225,7 @@ def _fit(
 ) -> JointFit:
     assert reference is not None and record.total_field is not None and record.quiet_field is not None
     loud = record.total_field - record.quiet_field
-    usable = how.among(record.time) & ~unread(adopted, record.time)
+    usable = how.among(record.time) & ~unread(adopted, record.time, record.station)
 
     def fitted(believed: NDArray[np.bool_] | None) -> JointFit:
         options: dict[str, Any] = {
@@ -269,7 +269,7 @@ def loud_stretches(record: Record, state: State, how: Fitting) -> tuple[tuple[fl
 def disturbed(record: Record, state: State, how: Fitting) -> NDArray[np.bool_]:
     """(N,) samples that neither the calibration nor noise explains, be it as loud as it is there; those at which a late
     log leaves the calibration without what it follows are none of them."""
-    out = ~np.asarray(state.fit.keep) & ~unread(state.adopted, record.time)
+    out = ~np.asarray(state.fit.keep) & ~unread(state.adopted, record.time, record.station)
     if not how.without or not out.any():
         return out
     raw, reference = without(record, [a.terms(state.excitation) for a in state.adopted], state.theta)

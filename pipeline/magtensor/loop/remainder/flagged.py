@@ -18,7 +18,6 @@ from magtensor.loop.remainder.sparse_readings import SparseReadings
 LONGEST_SPIKE = 2  # samples: what lasts longer is no accident of the recording
 MANY_FLAGGED = 0.01  # of the samples: of what is left, some is in these
 HYSTERESIS = "hysteresis"
-UNCOVERED = 2.0  # steps between samples
 ALIKE = 0.1  # of the mean square along the field, across it: an effect on each sensor shows as much in both
 AT_AN_END = 0.95  # of the other samples have smaller, or larger, values on average
 ALPHA = 0.001  # of the test whether samples after pauses are bad more often
@@ -51,21 +50,6 @@ def after_pauses(bad: Mask, x: Excitation) -> tuple[Mask, str]:
     return starts, f"; they come first after {found} of {pauses} pauses: something has not come to rest then"
 
 
-def beyond_the_reference(state: State, record: Record) -> Mask:
-    """(N,) samples for which a base station whose stamps are late or early has no reading within the survey."""
-    out = np.zeros(len(record.time), dtype=bool)
-    if len(record.time) < 2:
-        return out
-    step = float(np.median(np.diff(record.time)))
-    for model in state.adopted:
-        if model.component.effect == "reference" and (lag := float(model.settings.get("lag_s", 0.0))):
-            at = record.time + lag
-            after = np.clip(np.searchsorted(record.time, at), 1, len(record.time) - 1)
-            nearest = np.minimum(np.abs(at - record.time[after - 1]), np.abs(at - record.time[after]))
-            out |= nearest > UNCOVERED * step
-    return out
-
-
 def before_the_play(bad: Mask, state: State) -> tuple[Mask, str]:
     """(N,) bad samples that a survey begins with, while the play of an adopted hysteresis still shows what it began
     with, which nobody knows, and this in words; none, and "", otherwise."""
@@ -88,15 +72,23 @@ def before_the_play(bad: Mask, state: State) -> tuple[Mask, str]:
 
 
 def unread_words(state: State, record: Record) -> list[str]:
-    """How many samples were taken out of use because a log is late, which hardly matters for a spike's length."""
+    """How many samples were taken out of use because a log is late or the base station's stamps are wrong, which hardly
+    matters for a spike's length."""
+    words = []
     late = unread(state.adopted, record.time)
-    if late.sum() <= LONGEST_SPIKE:
-        return []
-    model = max(state.adopted, key=lambda model: model.late_s)
-    return [
-        f"the log that {model.name} follows is {model.late_s:.4g} s late: the last {int(late.sum())} samples, of which "
-        "it tells nothing, are flagged and have no part in the calibration"
-    ]
+    if late.sum() > LONGEST_SPIKE:
+        model = max(state.adopted, key=lambda model: model.late_s)
+        words.append(
+            f"the log that {model.name} follows is {model.late_s:.4g} s late: the last {int(late.sum())} samples, of "
+            "which it tells nothing, are flagged and have no part in the calibration"
+        )
+    alone = unread(state.adopted, record.time, record.station) & ~late
+    if alone.sum() > LONGEST_SPIKE:
+        words.append(
+            f"the base station, its stamps corrected, has no reading at {int(alone.sum())} samples: they are flagged "
+            "and have no part in the calibration"
+        )
+    return words
 
 
 def flagged_words(

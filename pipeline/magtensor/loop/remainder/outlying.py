@@ -54,7 +54,7 @@ class Outlying:
             return cls((), np.zeros((count, 0)), np.zeros((count, 0, 3)), np.zeros((count, 0), dtype=bool), size)
         square, off = alone(every, every.across)
         apart, _ = alone(every, every.across - median_filter(every.across, size=(NEIGHBOURS, 1), mode="mirror"))
-        wrong: Mask = beyond(square) & beyond(apart) & ~unread(state.adopted, record.time)[:, None]
+        wrong: Mask = beyond(square) & beyond(apart) & ~unread(state.adopted, record.time, record.station)[:, None]
         if every.along is not None:
             size = size * (np.sum(every.across**2, axis=1) < ALIKE * every.along**2)
         if len(names) == 2:

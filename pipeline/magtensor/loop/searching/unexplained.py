@@ -27,7 +27,6 @@ from magtensor.loop.remainder.flagged import (
     MANY_FLAGGED,
     after_pauses,
     before_the_play,
-    beyond_the_reference,
     flagged_words,
     lasting,
     unread_words,
@@ -61,8 +60,7 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
     bad = disturbed(record, state, found.how)
     starts, paused = after_pauses(bad, state.excitation)
     played, began = before_the_play(bad, state)
-    unseen = beyond_the_reference(state, record)
-    flagged = lasting(bad, unseen | played) | starts
+    flagged = lasting(bad, played) | starts
     suspects = Suspects.of(found, flagged, played, sparse)
     outlying = Outlying.of(state, record)
     too_often, theirs = outlying_words(outlying, ~np.asarray(state.fit.keep))
@@ -88,7 +86,7 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
         words.insert(0, size if excess else "in sum no more than the white noise, but no noise alone")
     beside += [sparse.words] if sparse is not None else suspects.noise_words
     beside += [*suspects.small_words, *([began] if began else [])]
-    beside += spike_words(outlying, bad & ~(lasting(bad) | starts | unseen | played | theirs))
+    beside += spike_words(outlying, bad & ~(lasting(bad) | starts | played | theirs))
     if record.absent:
         beside.append(f"not searched, for most of the survey lacks it: {', '.join(record.absent)}")
     if flagged.any():
