@@ -127,10 +127,13 @@ def require_sensors(survey: Survey, wanted: list[str], where: str) -> None:
         DataError: the survey has other sensors.
     """
     if survey.sensors != wanted:
+        another_order = sorted(survey.sensors) == sorted(wanted)
         raise DataError(
             f"the calibration is for the sensors {', '.join(wanted)}, the survey has {', '.join(survey.sensors)}",
             where=where,
-            hint="name the calibration that was made with these sensors, or give the survey's sensors these names",
+            hint="put the survey's sensors, with all that it holds of each, in the calibration's order"
+            if another_order
+            else "name the calibration that was made with these sensors, or give the survey's sensors these names",
         )
 
 

@@ -16,6 +16,7 @@ from magtensor.calibration.types import Array, ArrayCalibration
 from magtensor.errors import DataError, NotEnoughData
 from magtensor.frame.attitude import Attitude, attitude, mirrored_axis, require_consistent, require_unmirrored
 from magtensor.frame.calibration_errors import CalibrationErrors, errors_of
+from magtensor.frame.delay import Delay, attitude_delay
 from magtensor.frame.earlier import earlier
 from magtensor.frame.estimate import WORST, CommonRotation, carried, common_rotation, in_words
 from magtensor.frame.mounting import mounting
@@ -56,11 +57,13 @@ class Declared:
 
 @dataclass(frozen=True)
 class Tied:
-    """A calibration in the platform's frame, and in words what brought it there."""
+    """A calibration in the platform's frame, and in words what brought it there, and of an attitude that brought it by
+    how much it is late."""
 
     calibration: ArrayCalibration
     found: CommonRotation
     words: str
+    late: str = ""
 
 
 def tied(calibration: ArrayCalibration) -> bool:
@@ -91,6 +94,7 @@ def tie(
     for source in attitudes:
         require_unmirrored(source)
     found = common_rotation(read, errors, worst=worst)
+    late = _attitude_delay(survey) if attitudes else None
     for source in attitudes:
         require_consistent(source, found.rotation)
     frame = f"{PLATFORM} ({in_short(found)})"
@@ -101,7 +105,7 @@ def tie(
     if axis is not None and not any(source.world is not None for source in attitudes):
         left.append(MIRROR.format(axis=axis))
         words += f"; {left[-1]}"
-    return Tied(replace(turned, unobservable=tuple(left)), found, words)
+    return Tied(replace(turned, unobservable=tuple(left)), found, words, "" if late is None else late.words)
 
 
 def refined(survey: Survey, calibration: ArrayCalibration, worst: float) -> tuple[Tied, bool]:
@@ -176,6 +180,7 @@ def calibration_variables(survey: Survey, sensors: list[str], done: Tied) -> dic
         "std_deg": np.degrees(found.std),
         "alternatives_deg": json.dumps([np.degrees(w).round(3).tolist() for w in found.alternatives]),
         "words": done.words,
+        **({"attitude_delay": done.late} if done.late else {}),
     }
     return given | {"calibration/common_rotation": (("axis", "fitted_axis"), rotation, outcome)}
 
@@ -235,6 +240,13 @@ def _read(
         use &= np.isin(_segments(survey, wanted, "segments are named for the symmetry"), wanted)
     noise = _noise(survey, b, use)
     return [symmetry(b[use], np.asarray(survey.values("position"), dtype=float), noise, errors)]
+
+
+def _attitude_delay(survey: Survey) -> Delay | None:
+    b, q = (np.asarray(survey.values(name), dtype=float) for name in ("calibrated/b", "attitude"))
+    use = survey.good & np.isfinite(b).all(axis=(1, 2)) & np.isfinite(q).all(axis=1)
+    world = survey.values("reference/world_field") if "reference/world_field" in survey else None
+    return attitude_delay(survey.time[use], q[use], b[use].mean(axis=1), world)
 
 
 def _noise(survey: Survey, b: Array, use: NDArray[np.bool_]) -> Array:

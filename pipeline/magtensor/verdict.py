@@ -46,6 +46,10 @@ def verdict(survey: Survey, verify: dict[str, Any] | None = None) -> dict[str, A
         found |= loop
     if verify is not None:
         found["error"]["verify"] = verify
+    if late := dict(survey["calibration/common_rotation"].attrs if "calibration/common_rotation" in survey else {}).get(
+        "attitude_delay"
+    ):
+        found["attitude"] = {"description": str(late)}
     return found
 
 
@@ -112,7 +116,9 @@ def sentence(outcome: dict[str, Any]) -> str:
     noted = str(left["description"] or "").partition("; ")[2] if left["present"] is False else ""
     tail = f"; unexplained: {left['description']}" if left["present"] else f"; noted: {noted}" if noted else ""
     doubt = outcome.get("calibration", {}).get("description", "")
-    return f"{head}: {told}{tail}{_disagreement(outcome)}{f'; {doubt}' if doubt else ''}."
+    late = outcome.get("attitude", {}).get("description", "")
+    doubts = "".join(f"; {words}" for words in (late, doubt) if words)
+    return f"{head}: {told}{tail}{_disagreement(outcome)}{doubts}."
 
 
 def _figures(before: dict[str, Any] | None, after: dict[str, Any]) -> str:

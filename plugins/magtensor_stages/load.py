@@ -15,7 +15,7 @@ from magtensor.survey import checks, recorded_numbers, repeated, time_base
 from magtensor.survey.flags import Flag, flag_ranges
 from magtensor.survey.lone_readings import lone_readings
 from magtensor.survey.model import AXES, Survey
-from magtensor.units import TEMPERATURE, UNITS
+from magtensor.units import TEMPERATURE, UNITS, convert
 
 BY = "load"
 _READ_TOGETHER = 0.5  # of the readings of the sensor that has the fewest
@@ -81,6 +81,8 @@ def load(
     found, impossible = _without_impossible(found)
     _refuse_faults(found, magnitude, copied_axes, where)
     _judge_position(found, magnitude, where, notes)
+    if magnitude == "refuse":
+        _refuse_cold(found, where)
     good, flags = _flagged(found, impossible, saturation_nT)
     share = 1.0 - good.mean(axis=0)
     for name, bad in zip(found.sensors, share, strict=True):
@@ -342,6 +344,24 @@ def _judge_position(survey: Survey, magnitude: str, where: str, notes: list[str]
         )
     for s, t in zip(*np.nonzero(np.triu(apart == 0, 1)), strict=True):
         notes.append(f"the sensors {survey.sensors[s]} and {survey.sensors[t]} are stated to be at one place")
+
+
+def _refuse_cold(survey: Survey, where: str) -> None:
+    """Refuse thermometers that are below absolute zero."""
+    from magtensor.loop.fitting.record import channels_of
+
+    logged, units = channels_of(survey)
+    for name, values in logged.items():
+        known = UNITS.get(units[name])
+        if known is None or known.dimension != TEMPERATURE or not np.isfinite(values).any():
+            continue
+        usual = float(np.nanmedian(convert(values, units[name], "degC")))
+        if usual < checks.ABSOLUTE_ZERO:
+            raise DataError(
+                f"its median is {usual:.6g} degC, below absolute zero",
+                where=f"{where}: {name}",
+                hint="are its units right (degC labelled K)? `load: {magnitude: accept}` lets it pass",
+            )
 
 
 def _flagged(

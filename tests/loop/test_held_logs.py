@@ -92,7 +92,7 @@ def test_a_temperature_offset_keeps_its_lag_and_needs_no_helper(held: bool, tmp_
     assert told["adopted"][0]["settings"]["lag_s"] == pytest.approx(50.0, abs=10.0)
 
 
-@pytest.mark.parametrize("every", [*(pytest.param(n, marks=pytest.mark.long) for n in (2, 12)), 60])
+@pytest.mark.parametrize("every", [2, *(pytest.param(n, marks=pytest.mark.long) for n in (12, 60))])
 def test_a_log_in_rows_of_its_own_is_searched(tmp_path: Path, every: int) -> None:
     """A thermometer that is read seldom, in a table that has a row for every sample: the others are empty."""
 
@@ -115,7 +115,7 @@ def test_a_log_in_rows_of_its_own_is_searched(tmp_path: Path, every: int) -> Non
     [
         (slice(None, None, 60), True),
         (slice(0, 1100), False),  # and then the thermometer was off
-        (slice(None, None, 800), False),  # four readings are no course
+        pytest.param(slice(None, None, 800), False, marks=pytest.mark.long),  # four readings are no course
     ],
 )
 def test_a_channel_that_most_of_the_survey_lacks_is_told(tmp_path: Path, read: slice, searched: bool) -> None:

@@ -20,6 +20,7 @@ from magtensor.loop.fitting.trial import on_the_folds_of, trial
 from magtensor.loop.searching.contribution import eliminate, removal
 from magtensor.loop.searching.gates import ALPHA, SECOND_ORDER, Candidate
 from magtensor.loop.searching.outcome import why
+from magtensor.loop.searching.rivals import part_of_a_drift
 from magtensor.loop.searching.screening import candidates_of
 from magtensor.registry import Registry
 
@@ -106,7 +107,11 @@ def test_the_folds_of_the_third_gate_divide_what_happens_once() -> None:
 PULSE = slice(300, 420)  # within the second of five folds, over one edge of ten
 
 
-@pytest.mark.parametrize("on", [PULSE, slice(1132, SAMPLES), slice(0, 232)], ids=["once", "from late on", "at first"])
+@pytest.mark.parametrize(
+    "on",
+    [PULSE, slice(350, 439), slice(1132, SAMPLES), slice(0, 232)],
+    ids=["once", "hardly in the fold before", "from late on", "at first"],
+)
 def test_what_was_on_once_is_judged_on_folds_that_know_of_it(on: slice) -> None:
     """The others know nothing but the noise of the log: what they make of it is no judgement of the effect."""
     rng = np.random.default_rng(12)
@@ -123,6 +128,26 @@ def test_what_was_on_once_is_judged_on_folds_that_know_of_it(on: slice) -> None:
     assert with_it == pytest.approx(0.2, rel=0.05) and without > 1.5 * with_it
     kept, dropped = eliminate(record, after.state, Fitting(), 0)
     assert [a.name for a in kept.adopted] == ["current_field"] and dropped == ()
+
+
+@pytest.mark.parametrize(("log_noise", "instead"), [(0.005, True), (0.0, True), (1e-6, False)])
+def test_what_was_on_once_is_the_current_whose_log_is_noisy(log_noise: float, instead: bool) -> None:
+    """A heater of 30 nT for a while: without the noise of the log an offset meanwhile explains more, and is no more
+    than the current. One that changed otherwise than its current, by far more than the log's noise, is."""
+    rng = np.random.default_rng(15)
+    current, added = np.zeros(SAMPLES), np.zeros((SAMPLES, 4, 3))
+    current[PULSE] = 1.5
+    vectors = 20.0 * rng.standard_normal((4, 3))
+    added += current[:, None, None] * vectors
+    if not instead:
+        current[PULSE] *= np.linspace(0.9, 1.1, PULSE.stop - PULSE.start)
+    record = survey_with(16, current + log_noise * rng.standard_normal(SAMPLES), added)
+    state = linear_state(record)
+    found = {c.model.name: c for c in candidates_of(state, [model("current_field"), model("offset_while")], {}, ALPHA)}
+    event = found["offset_while"]
+    assert event.passes
+    lasting = part_of_a_drift(event, list(found.values()), state)
+    assert (lasting is not None and lasting.passes) is instead
 
 
 def test_a_channel_seen_elsewhere_if_less_divides_no_fold() -> None:

@@ -224,16 +224,29 @@ def test_a_survey_that_disagrees_says_whether_a_calibration_is_why(
     assert told in sentence(found)
 
 
-def test_a_survey_that_cannot_verify_costs_no_result(surveys: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("names", "told"),
+    [
+        (["front", "left", "back", "right"], "or give the survey's sensors these names"),
+        (
+            ["S2", "S1", "S3", "S4"],
+            "put the survey's sensors, with all that it holds of each, in the calibration's order",
+        ),
+    ],
+)
+def test_a_survey_that_cannot_verify_costs_no_result(
+    names: list[str], told: str, surveys: Path, tmp_path: Path
+) -> None:
     other = tmp_path / "renamed.h5"
     shutil.copy(surveys / "verify.h5", other)
     with h5py.File(other, "a") as file:
-        file["sensor"][:] = ["front", "left", "back", "right"]
+        file["sensor"][:] = names
     recipe = tmp_path / "recipe.yaml"
     recipe.write_text(RECIPE.replace("survey.h5", str(surveys / "survey.h5")))
     finished = run_recipe(recipe, tmp_path / "out", verify=other)
     error = json.loads((tmp_path / "out/verdict.json").read_text())["error"]
     assert error["verify"]["before"] is None and error["verify"]["after"] is None
-    assert "the survey has front, left, back, right" in error["verify"]["not_possible"]
+    assert f"the survey has {', '.join(names)}" in error["verify"]["not_possible"]
+    assert told in error["verify"]["not_possible"]
     assert "NOT verified: the calibration is for the sensors S1, S2, S3, S4" in finished.sentence
     assert "verification survey" not in finished.sentence and (tmp_path / "out/calibration.nc").exists()

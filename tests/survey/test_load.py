@@ -101,6 +101,9 @@ WARM = 18.0 + 4.0 * np.sin(np.arange(400) / 60.0)
         (np.where(np.arange(400) % 90 == 7, -999.0, WARM), -999.0),
         (np.where(np.arange(400) > 300, 9999.9, WARM).astype(np.float32), 9999.9),
         (np.where(np.arange(400) == 3, -9999.0, np.where(np.arange(400) % 3, np.nan, WARM)), -9999.0),
+        (np.where(np.arange(400) % 7 == 2, 1e30, WARM), 1e30),
+        (np.where(np.arange(400) % 3 == 2, 9.969209968386869e36, WARM), 9.969209968386869e36),  # of netCDF
+        (np.where(np.arange(400) % 7 == 2, 1e4, WARM), None),
         (WARM, None),
         (np.arange(600.0, 1000.0), None),  # a counter gets there
         (np.where(np.arange(400) % 2, 999.0, WARM), None),  # as often as not: a switch
@@ -122,6 +125,15 @@ def test_numbers_that_stand_for_missing_values_of_a_channel(
         np.testing.assert_array_equal(kept, np.where(lost, np.nan, values))
         assert survey["temperature"].attrs["units"] == "degC"
         assert f"temperature: {lost.sum()} values of {found:.6g}, far from all" in survey.attributes["notes"][0]
+
+
+def test_a_thermometer_below_absolute_zero_is_refused(load_variables: Load, variables: Variables) -> None:
+    board = {"board": (["time"], WARM - 40.0, {"units": "K"})}
+    with pytest.raises(DataError, match=r"board: its median is -29\d\.\d+ degC, below absolute zero\n  .*labelled K"):
+        load_variables({**variables, **board})
+    assert "board" in load_variables({**variables, **board}, magnitude="accept")
+    for cold in ((["time"], WARM, {"units": "K"}), (["time"], WARM - 300.0, {"units": "V"})):
+        assert "board" in load_variables({**variables, "board": cold})
 
 
 def test_missing_and_infinite_values_are_flagged(load_variables: Load, variables: Variables) -> None:

@@ -18,6 +18,8 @@ MARGIN = 2.0
 LARGEST_ARRAY_M = 100.0
 FAR_FILL = 5.0  # times what all other values span
 NINES = re.compile(r"-?9{2,}\.?9+")  # as six digits show it
+ENORMOUS = 1e15  # no channel of an instrument goes so far in any units: what a file format puts where nothing is
+ABSOLUTE_ZERO = -273.15  # degC
 IMPOSSIBLE = 1e3  # times a sensor's median magnitude: no range reaches so far beyond what it measures
 # What a number that was labelled nT may have been, with the factor that makes nT of it.
 RIVALS = (
@@ -53,8 +55,9 @@ def impossible(field: Floats) -> Bools:
 def fill_value(values: Floats) -> float | None:
     """The number that stands for a missing value in a logged channel though nothing declares it; else None.
 
-    Three nines or more, with either sign, that no other value of the channel comes near: farther from all of them than
-    `FAR_FILL` times what they span. In less than half of the samples.
+    Three nines or more, or a number beyond all that is measured (1e20, 9.96921e36), with either sign, that no other
+    value of the channel comes near: farther from all of them than `FAR_FILL` times what they span. In less than half of
+    the samples.
 
     Args:
         values: a channel, NaN allowed.
@@ -62,7 +65,7 @@ def fill_value(values: Floats) -> float | None:
     finite = values[np.isfinite(values)]
     for found in (float(finite.min()), float(finite.max())) if len(finite) else ():
         others = finite[finite != found]
-        if len(others) <= len(finite) / 2 or not NINES.fullmatch(f"{found:.6g}"):
+        if len(others) <= len(finite) / 2 or not (NINES.fullmatch(f"{found:.6g}") or abs(found) > ENORMOUS):
             continue
         spread, away = float(np.ptp(others)), float(np.min(np.abs(others - found)))
         if 0 < FAR_FILL * spread < away:

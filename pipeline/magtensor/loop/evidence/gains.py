@@ -18,7 +18,7 @@ INTERLEAVED_FOLDS = 20
 LEAST_T = 2.0  # paired t of the held-out gain over folds
 LEAST_SHARE_OF_FOLDS = 0.8  # a strong slow effect gains unevenly, which keeps t low, but nearly everywhere
 WORSE = 4.0  # standard deviations below the mean of the folds, of the worst of ten
-CONCENTRATED = 0.9  # of what is known, in one fold: the others do not predict it
+CONCENTRATED = 0.9  # of what is known, in one fold or two neighbours: the others do not predict it
 MOST_FOLDS = 0.5  # that may be no judges
 
 
@@ -124,10 +124,12 @@ def focused_folds(g: Grams, blocked: NDArray[np.bool_]) -> NDArray[np.int_]:
 
 
 def concentrated(g: Grams, blocked: NDArray[np.bool_]) -> bool:
-    """Whether one contiguous fold of equal length holds nearly all that is known of the terms that are not blocked."""
+    """Whether two neighbouring folds of equal length hold nearly all that is known of the terms that are not blocked:
+    an edge between folds may lie anywhere in what was on once."""
     share, count = _share_of_blocks(g, ~blocked), len(g.zz)
     edges = np.linspace(0, count, min(FOLDS, count) + 1).round().astype(int)[:-1]
-    return bool(np.add.reduceat(share, edges).max() > CONCENTRATED)
+    each = np.add.reduceat(share, edges)
+    return bool((each[1:] + each[:-1]).max(initial=each.max()) > CONCENTRATED)
 
 
 def _share_of_blocks(g: Grams, chosen: NDArray[np.bool_]) -> Array:

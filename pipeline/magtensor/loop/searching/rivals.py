@@ -148,7 +148,9 @@ def part_of_a_drift(candidate: Candidate, candidates: Sequence[Candidate], state
         if not gain.consistent and other.adjusted_null_p >= other.alpha:
             continue
         whole, own, both = _beside(candidate, other, state)
-        if own <= whole and both - whole < SMALL_PART * own:
+        if own > whole and not worse_log(candidate, other, own - whole, state):
+            continue
+        if both - whole < SMALL_PART * own:
             return _judged_by_its_part(other, candidate, state)
     return None
 

@@ -16,7 +16,7 @@ from magtensor.error_models.terms import Terms
 from magtensor.loop.evidence.estimate import Estimate
 from magtensor.loop.fitting.log_noise import brought_in, would_bring_in
 from magtensor.loop.fitting.model import Adopted, State
-from magtensor.loop.searching.contribution import slices
+from magtensor.loop.searching.contribution import happens_once, slices
 from magtensor.loop.searching.gates import Candidate, gained_of_a_log
 
 OUTSIDE = 0.01  # of what coefficients explain, that vectors which are the same may miss: a tenth of their size
@@ -53,12 +53,14 @@ def of_another_log(state: State, model: Adopted, terms: Terms, estimate: Estimat
 def worse_log(best: Candidate, other: Candidate, behind: float, state: State) -> bool:
     """Whether a model has the vectors of a better one, and the noise of its log explains what it is behind by.
 
+    The better one follows another log, or none: what was switched on once did so without noise.
+
     Parameters
     ----------
     behind: twice the log likelihood ratio on held-out folds.
     """
     x = state.excitation
-    if not (best.model.channels(x) and other.model.channels(x)):
+    if not other.model.channels(x) or not (best.model.channels(x) or happens_once(best.model)):
         return False
     first = len(best.assessment.estimate.theta) - best.terms.count
     own, its = best.assessment.estimate.theta[first:], other.assessment.estimate.theta[first:]
