@@ -46,10 +46,9 @@ def verdict(survey: Survey, verify: dict[str, Any] | None = None) -> dict[str, A
         found |= loop
     if verify is not None:
         found["error"]["verify"] = verify
-    if late := dict(survey["calibration/common_rotation"].attrs if "calibration/common_rotation" in survey else {}).get(
-        "attitude_delay"
-    ):
-        found["attitude"] = {"description": str(late)}
+    if "calibration/common_rotation" in survey:
+        late = survey["calibration/common_rotation"].attrs.get("attitude_delay")
+        found |= {"attitude": {"description": str(late)}} if late else {}
     return found
 
 
