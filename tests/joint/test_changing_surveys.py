@@ -22,7 +22,7 @@ SENSORS = ["S1", "S2", "S3", "S4"]
     "case",
     [
         Case(samples=(60, 40, 40, 60), tilt_deg=40.0),
-        Case(samples=(80, 80, 80), years=(0.0, 1.0, 2.5), sensors=1),
+        pytest.param(Case(samples=(80, 80, 80), years=(0.0, 1.0, 2.5), sensors=1), marks=pytest.mark.long),
         pytest.param(Case(samples=(80, 60), years=(0.0, 1.0), sensors=2, offsets="common"), marks=pytest.mark.long),
         Case(samples=(60, 40, 60), years=(0.0, 1.0, 2.0), offsets="linear", attitude_deg=0.3),
     ],

@@ -41,7 +41,9 @@ FITS = 12
         (Case(samples=(12,) * 5, tilt_deg=60.0), temperature_offset),
         pytest.param(Case(samples=(300, 200), tilt_deg=40.0, apart_nT=0.0), temperature_scale, marks=pytest.mark.long),
         pytest.param(Case(samples=(400,), tilt_deg=40.0, attitude_deg=0.3), temperature_offset, marks=pytest.mark.long),
-        (Case(samples=(200, 200), tilt_deg=40.0, attitude_deg=0.05), temperature_scale),
+        pytest.param(
+            Case(samples=(200, 200), tilt_deg=40.0, attitude_deg=0.05), temperature_scale, marks=pytest.mark.long
+        ),
         pytest.param(Case(samples=(300, 200), tilt_deg=60.0, levels=3), temperature_scale, marks=pytest.mark.long),
         (Case(samples=(300, 300), tilt_deg=60.0, sensors=1), temperature_offset),
     ],

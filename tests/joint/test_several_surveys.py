@@ -37,7 +37,7 @@ def test_one_survey_is_the_joint_fit(sensors: int, reference_noise: float) -> No
         Case(samples=(150, 150), sensors=1),
         pytest.param(Case(samples=(150, 150), sensors=2), marks=pytest.mark.long),
         pytest.param(Case(samples=(100, 200), apart_nT=0.0, tilt_deg=40.0), marks=pytest.mark.long),
-        Case(samples=(150, 150), apart_nT=3000.0),
+        pytest.param(Case(samples=(150, 150), apart_nT=3000.0), marks=pytest.mark.long),
     ],
     ids=str,
 )
