@@ -84,11 +84,19 @@ def test_an_effect_that_a_survey_does_not_have_is_told(
         assert (words in said) is told
 
 
+@pytest.mark.parametrize("times", [1.0, 1.5])
 def test_a_missing_channel_is_told_with_survey_and_effect(
-    tmp_path: Path, folder: Path, heated: ClosedLoop, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, folder: Path, heated: ClosedLoop, capsys: pytest.CaptureFixture[str], times: float
 ) -> None:
+    """In a stronger field than the calibration has seen as well."""
+
+    def without(file: h5py.File) -> None:
+        del file["current_heater"]
+        file["b_raw"][...] = times * file["b_raw"][()]
+        file["reference/total_field"][...] = times * file["reference/total_field"][()]
+
     heated.calibration.save(tmp_path / "c.nc")
-    bare = changed(folder, "hot.h5", lambda f: f.pop("current_heater"))
+    bare = changed(folder, "hot.h5", without)
     assert status_of(["apply", str(tmp_path / "c.nc"), str(bare), "--output", str(tmp_path / "a.nc")]) == 3
     said = capsys.readouterr().err
     assert re.search(

@@ -10,6 +10,7 @@ import numpy as np
 from magtensor.calibration.types import Array
 from magtensor.error_models.settings import AnyChannel, profiled
 from magtensor.error_models.waveform import NAME
+from magtensor.errors import DataError
 from magtensor.loop.fitting.model import Adopted, Record
 from magtensor.loop.fitting.record import record_of
 from magtensor.survey.model import Survey
@@ -41,7 +42,11 @@ def extrapolated(
     ranges, largest = (json.loads(str(known.get(of, "[]"))) for of in ("channel_ranges", "largest_outputs_nT"))
     found: dict[str, list[str]] = {}
     for effect in here:
-        if words := [*_of_channels(record, effect, ranges), *_of_the_field(record, effect, largest)]:
+        try:
+            words = [*_of_channels(record, effect, ranges), *_of_the_field(record, effect, largest)]
+        except (DataError, KeyError):  # what it follows is missing: told where it is to be taken off
+            continue
+        if words:
             found.setdefault(effect.name, []).extend(words)
     return {name: "; ".join(dict.fromkeys(words)) for name, words in found.items()}
 
