@@ -11,13 +11,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from magtensor.calibration.types import Array
+from magtensor.golden import golden
 from magtensor.misread import misfit
 
 MOST_SAMPLES = 5000
 LONGEST_STEPS = 64.0  # steps between samples: a longer delay is another mistake
 MOST_LEFT = 0.5  # of the square of the misfit: with more, the delay is not what most of it is
 ROUNDS = 24  # of the search between two neighbours of the grid
-GOLDEN = (np.sqrt(5.0) - 1.0) / 2.0
 
 
 @dataclass(frozen=True)
@@ -73,9 +73,6 @@ def attitude_delay(time: Array, quaternions: Array, b: Array, world: Array | Non
     found = [left(delay) for delay in grid]
     best = int(np.argmin(found))
     low, high = grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)]
-    for _ in range(ROUNDS):
-        a, c = high - GOLDEN * (high - low), low + GOLDEN * (high - low)
-        low, high = (low, c) if left(a) < left(c) else (a, high)
-    delay = 0.5 * (low + high)
+    delay = golden(lambda delay: -left(delay), low, high, float(grid[best]), ROUNDS)
     before, after = left(0.0), left(delay)
-    return Delay(float(delay), before, after) if after**2 < MOST_LEFT * before**2 else None
+    return Delay(delay, before, after) if after**2 < MOST_LEFT * before**2 else None

@@ -10,7 +10,7 @@ import numpy as np
 
 from magtensor.error_models.settings import AsAWhole, Beginning, EventTimes, Forms, Frequencies, Range, profiled
 from magtensor.error_models.terms import Terms
-from magtensor.loop.evidence.golden import golden
+from magtensor.golden import golden
 from magtensor.loop.evidence.scoring import Scorer
 from magtensor.loop.fitting.model import Adopted, Fitting, Record, State
 from magtensor.loop.fitting.refit import joint_state

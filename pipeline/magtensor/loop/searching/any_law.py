@@ -19,9 +19,9 @@ from magtensor.components import Component
 from magtensor.error_models.curves import bends_of
 from magtensor.error_models.settings import AnyChannel, Bends, Choice, profiled
 from magtensor.error_models.terms import Terms, joined
+from magtensor.golden import golden
 from magtensor.loop.evidence.assessment import WHITE, assess, colours_of, estimated, likeliest
 from magtensor.loop.evidence.estimate import Estimate
-from magtensor.loop.evidence.golden import golden
 from magtensor.loop.evidence.grams import Whitened
 from magtensor.loop.evidence.scoring import Scorer
 from magtensor.loop.fitting.log_noise import brought_in

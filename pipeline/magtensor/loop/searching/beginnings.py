@@ -12,9 +12,9 @@ from magtensor.components import Component
 from magtensor.error_models.excitation import Excitation
 from magtensor.error_models.settings import AnyChannel, Beginning, Orders, profiled
 from magtensor.error_models.terms import Terms, joined
+from magtensor.golden import golden
 from magtensor.loop.evidence.assessment import WHITE, assess, colours_of, estimated_in, left_there, likeliest
 from magtensor.loop.evidence.folds import Blocks
-from magtensor.loop.evidence.golden import golden
 from magtensor.loop.evidence.grams import Whitened
 from magtensor.loop.evidence.lone_event import MOST_LEFT
 from magtensor.loop.evidence.residual import Residual

@@ -11,8 +11,8 @@ from magtensor.components import Component
 from magtensor.error_models.excitation import Excitation
 from magtensor.error_models.settings import Cleaned, EventTimes, Frequencies, Range, profiled
 from magtensor.error_models.terms import Terms, joined
+from magtensor.golden import REFINEMENTS, golden
 from magtensor.loop.evidence.assessment import WHITE, colours_of, estimated, likeliest
-from magtensor.loop.evidence.golden import REFINEMENTS, golden
 from magtensor.loop.evidence.residual import Residual
 from magtensor.loop.evidence.scoring import Scorer
 from magtensor.loop.fitting.model import State

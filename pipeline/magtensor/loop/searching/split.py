@@ -15,8 +15,8 @@ import numpy as np
 from magtensor.calibration.types import Array
 from magtensor.error_models.settings import profiled
 from magtensor.error_models.terms import joined
+from magtensor.golden import golden
 from magtensor.loop.evidence.assessment import WHITE, assess, colours_of, estimated, likeliest
-from magtensor.loop.evidence.golden import golden
 from magtensor.loop.evidence.grams import Whitened
 from magtensor.loop.evidence.scoring import Scorer
 from magtensor.loop.fitting.log_noise import brought_in
