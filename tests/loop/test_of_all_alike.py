@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -12,7 +13,7 @@ from loop_cases import linear_state, looked_at, scenario, synthetic, verdict_of
 
 from magtensor.loop.fitting.model import Adopted, Fitting
 from magtensor.loop.fitting.refit import joint_state
-from magtensor.loop.searching.contribution import of_all_alike
+from magtensor.loop.searching.like_a_station import as_a_station_would
 from magtensor.loop.searching.own_fit import plainer_forms
 from magtensor.registry import Registry
 
@@ -28,18 +29,31 @@ def test_scale_factors_that_drift_together_and_apart(sensors: tuple[int, ...], a
     record = synthetic(21, turning_s=4.0, added=added)
     model = Adopted(Registry.load().find("error_model", "scale_drift"), {"order": 1, "span_s": 1199.0})
     state = joint_state(record, [model], Fitting())
-    assert of_all_alike(state, 0) is alike
+    assert as_a_station_would(state, 0) is alike
 
 
-def test_one_offset_of_all_sensors_is_a_field_that_drifts() -> None:
+@pytest.mark.parametrize(("turning_s", "alike"), [(4.0, False), (80.0, True)])
+def test_one_offset_of_all_sensors_turns_with_the_platform_if_that_turns(turning_s: float, alike: bool) -> None:
     added = np.zeros((1200, 4, 3))
     added += np.linspace(-2.0, 2.0, 1200)[:, None, None]
-    record = synthetic(22, turning_s=4.0, added=added)
+    record = synthetic(22, turning_s=turning_s, added=added)
     model = Adopted(Registry.load().find("error_model", "offset_drift"), {"order": 1, "span_s": 1199.0})
     state = joint_state(record, [model], Fitting())
     own = joint_state(record, [], Fitting())
     assert state.residual.square() < own.residual.square()
-    assert of_all_alike(state, 0)
+    assert as_a_station_would(state, 0) is alike
+
+
+@pytest.mark.parametrize(
+    "effect",
+    [
+        {"type": "temperature_offset", "nT_per_degC": [0.3, 0.2, 0.1]},
+        {"type": "current_field", "channel": "current_heater", "nT_per_A": [0.4, -0.3, 0.5]},
+    ],
+)
+def test_what_every_sensor_has_alike_is_found_where_the_platform_turns(effect: dict[str, Any], tmp_path: Path) -> None:
+    told = verdict_of(tmp_path, scenario(5, effect))
+    assert [a["error_model"] for a in told["adopted"]] == [effect["type"]]
 
 
 def test_a_base_station_that_follows_the_temperature_is_no_fault_of_the_sensors(tmp_path: Path) -> None:

@@ -276,6 +276,10 @@ def test_shapes(shape: str, count: int) -> None:
         ),
         ({"motion": {"type": "tumbling"}}, "motion: needs 'duration_s'"),
         ({"motion": {"type": "tumble"}}, "did you mean tumbling"),
+        (
+            {"effects": [{"type": "current_field", "channel": "i", "nT_per_unit": [1.0, 2.0, 3.0]}]},
+            r"nT_per_unit: unknown key \(did you mean nT_per_A\?\)",
+        ),
         ({"seed": "one"}, "seed: input should be a valid integer"),
         ({"rate_Hz": float("nan")}, "rate_Hz: input should be a finite number"),
         ({"rate_Hz": -1.0}, "rate_Hz: input should be greater than 0"),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar, get_args
 
 from magtensor.errors import UsageError, did_you_mean
 from magtensor.recipe.source import Document, Location
@@ -115,32 +115,26 @@ def _walk(value: Any, location: Sequence[str | int]) -> tuple[tuple[str | int, .
 
 
 def _known_keys(model: type[BaseModel], location: Sequence[str | int]) -> list[str]:
-    """The keys of the (nested) model at pydantic's location, as far as its branches can be told."""
-    from typing import get_args
+    """The keys of the (nested) model at pydantic's location, which names fields, places in lists and union branches."""
+    current = [model]
+    for part in location:
+        inside = [m for c in current if part in c.model_fields for m in _models(c.model_fields[str(part)].annotation)]
+        current = inside or [c for c in current if part == c.__name__ or _is_tagged(c, part)] or current
+    return sorted({f.alias or n for c in current for n, f in c.model_fields.items()})
 
+
+def _models(annotation: Any) -> list[type[BaseModel]]:
+    """The models that a value of this type may be, or hold."""
     from pydantic import BaseModel
 
-    current: list[Any] = [model]
-    for part in location:
-        following: list[Any] = []
-        for candidate in current:
-            if isinstance(candidate, type) and issubclass(candidate, BaseModel):
-                if part in candidate.model_fields:
-                    following.append(candidate.model_fields[str(part)].annotation)
-                elif part == candidate.__name__:
-                    following.append(candidate)
-                continue
-            for inner in get_args(candidate):
-                following.append(inner)
-        current = following or current
-    keys: set[str] = set()
-    while current:
-        candidate = current.pop()
-        if isinstance(candidate, type) and issubclass(candidate, BaseModel):
-            keys |= {f.alias or n for n, f in candidate.model_fields.items()}
-        else:
-            current.extend(get_args(candidate))
-    return sorted(keys)
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    return [m for inner in get_args(annotation) for m in _models(inner)]
+
+
+def _is_tagged(model: type[BaseModel], tag: str | int) -> bool:
+    """Whether it is the branch of a union that a field's only value names."""
+    return any(get_args(f.annotation) == (tag,) for f in model.model_fields.values())
 
 
 def _scalar(value: Any) -> bool:

@@ -13,10 +13,10 @@ from magtensor.calibration.types import Array
 from magtensor.error_models.settings import EventTimes, Frequencies, profiled
 from magtensor.error_models.terms import Terms
 from magtensor.error_models.waveform import NAME
-from magtensor.loop.evidence.assessment import WHITE, Colours, estimated_in, explained
+from magtensor.loop.evidence.assessment import WHITE, Colours
 from magtensor.loop.evidence.folds import Blocks
 from magtensor.loop.evidence.gains import Gain, concentrated, focused_gain, held_out_gain
-from magtensor.loop.evidence.grams import Grams, Whitened, grams
+from magtensor.loop.evidence.grams import Grams, grams
 from magtensor.loop.evidence.own_noise import OwnNoise
 from magtensor.loop.evidence.residual import Residual, taken_off
 from magtensor.loop.evidence.statistics import Families
@@ -26,7 +26,6 @@ from magtensor.loop.fitting.trial import WORST_RISE, on_the_folds_of, trial
 from magtensor.loop.searching.beginnings import at_its_limit
 
 LEAST_FALL = 5e-4  # of the error on held-out blocks, by what lasts: 3 % of the noise is no effect anybody would miss
-APART_ALPHA = 1e-4  # what differs between sensors has to be as unlikely, before an effect of all is not the reference's
 LEAST_SAMPLES = 6.0  # that hold nearly all of what happened once
 KEEP_ALPHA = 0.01  # an adopted effect that is no longer significant at this level is dropped
 
@@ -103,25 +102,6 @@ def _all_but(state: State, places: Sequence[int]) -> NDArray[np.bool_]:
     for place in places:
         others[slices(state)[place]] = False
     return others
-
-
-def of_all_alike(state: State, place: int) -> bool:
-    """Whether an adopted model explains nothing of what differs between the sensors: all it does may be done by the
-    total field that they are compared with."""
-    assert state.terms is not None
-    own = slices(state)[place]
-    if state.residual.across is None or state.residual.along is None:
-        return False
-    from scipy.special import chdtrc
-
-    order = np.arange(state.terms.count)
-    mine = state.terms.only(range(own.start, own.stop))
-    back = put_back(state.residual, mine, state.theta[place])
-    others = state.terms.only(int(i) for i in order[(order < own.start) | (order >= own.stop)])
-    white = Whitened.of(replace(back, along=None), state.colours.across, state.colours.along, others, over_time=False)
-    with_it, without = estimated_in(white, mine), estimated_in(white, None)
-    gained = explained(with_it) - explained(without)
-    return with_it.rank == without.rank or float(chdtrc(with_it.rank - without.rank, max(gained, 0.0))) > APART_ALPHA
 
 
 def put_back(residual: Residual, terms: Terms, theta: Array) -> Residual:
