@@ -48,6 +48,7 @@ def test_one_offset_of_all_sensors_turns_with_the_platform_if_that_turns(turning
     "effect",
     [
         {"type": "temperature_offset", "nT_per_degC": [0.3, 0.2, 0.1]},
+        {"type": "temperature_scale", "ppm_per_degC": [10.0, 16.0, 7.0]},
         {"type": "current_field", "channel": "current_heater", "nT_per_A": [0.4, -0.3, 0.5]},
     ],
 )

@@ -23,6 +23,7 @@ DRAWS = 300  # of directions for each size, and as many for none
 MOST_CERTAIN = 0.05  # of a band's power is left at least, where a size is said to explain all of it
 EXACT_ORDER = 30.0  # of Bessel functions; beyond it they are given by their uniform expansion, to a thousandth
 ROUNDING = 1e-12
+SPHERE = 3  # dimensions
 
 
 def one_series_p(counts: Array, product: Array, square: Array, power: Array) -> float:
@@ -66,10 +67,13 @@ def _log_mean(length: Array, dimension: Array | float) -> Array:
     """Log of the mean of exp(v . u) over all unit vectors u of a dimension, of vectors v of that length.
 
     That is Gamma(m + 1) (2 / v)^m I_m(v), m = dimension / 2 - 1 (Mardia and Jupp 2000, equation 9.3.4); where m is
-    large by the uniform expansion of I_m (Abramowitz and Stegun 1964, 9.7.7).
+    large by the uniform expansion of I_m (Abramowitz and Stegun 1964, 9.7.7). In three dimensions it is sinh(v) / v.
     """
     from scipy.special import gammaln, ive
 
+    if np.ndim(dimension) == 0 and dimension == SPHERE:
+        v = np.maximum(length, ROUNDING)
+        return np.asarray(v - np.log(2.0 * v) + np.log(-np.expm1(-2.0 * v)))
     length, order = np.broadcast_arrays(length, np.asarray(dimension) / 2.0 - 1.0)
     out = length**2 / (4.0 * (order + 1.0))  # of short ones
     exact = (order <= EXACT_ORDER) & (length > 1e-4)

@@ -16,15 +16,15 @@ from magtensor.loop.fitting.model import Adopted, State
 from magtensor.loop.searching.contribution import put_back, slices
 
 APART_ALPHA = 1e-4  # what no station does has to be as unlikely by chance
-MOST_OF_IT = 0.5  # of what a model explains of |b| - F has to be none of a station's
+A_PART = 0.1  # of what a model explains of |b| - F has to be none of a station's
 COURSES = 20  # half waves over the survey: what a station does slowly, whatever the cause
 
 
 def as_a_station_would(state: State, place: int) -> bool:
     """Whether a base station that drifts, or follows the channels of an adopted model, would look the same as it.
 
-    It would where the model explains nothing of what differs between the sensors, and little of |b| - F beside a course
-    of all sensors alike: what a vector in the sensors' axes makes turns with the platform, which no station does.
+    It would where the model explains nothing of what differs between the sensors, and next to nothing of |b| - F beside
+    courses that all sensors see alike: what a vector in their axes makes turns with the platform, which no station does.
     """
     if state.residual.across is None or state.residual.along is None:
         return False
@@ -39,7 +39,7 @@ def as_a_station_would(state: State, place: int) -> bool:
     alike = _of_a_station(state.excitation, state.adopted[place]).at(back.samples)
     turning, by_chance = _beyond(along, colours, mine, [others, alike])
     either = turning + _beyond(along, colours, alike, [others])[0]
-    return by_chance > APART_ALPHA or turning < MOST_OF_IT * either
+    return by_chance > APART_ALPHA or turning < A_PART * either
 
 
 def _of_a_station(x: Excitation, model: Adopted) -> Terms:
