@@ -24,7 +24,7 @@ def as_a_station_would(state: State, place: int) -> bool:
     """Whether a base station that drifts, or follows the channels of an adopted model, would look the same as it.
 
     It would where the model explains nothing of what differs between the sensors, and next to nothing of |b| - F beside
-    courses that all sensors see alike: what a vector in their axes makes turns with the platform, which no station does.
+    courses that all sensors see alike. What a vector in their axes makes turns with the platform: no station does that.
     """
     if state.residual.across is None or state.residual.along is None:
         return False
