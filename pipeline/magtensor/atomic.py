@@ -117,7 +117,7 @@ def require_writable(directory: Path) -> None:
         with tempfile.TemporaryFile(dir=place):  # permissions alone do not tell: a file system may be read-only
             pass
     except OSError as error:
-        raise UsageError(f"{directory}: cannot be written: {place}: {error.strerror or error}") from error
+        raise UsageError(f"{directory}: cannot be written: {place} takes no file: {error.strerror or error}") from error
 
 
 def _make(directory: Path) -> None:

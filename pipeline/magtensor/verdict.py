@@ -13,6 +13,7 @@ from magtensor.survey.model import Survey
 SCHEMA = 1
 ERRORS = {"total_field_rms_nT": ("total field", "nT"), "tensor_rms_nT_per_m": ("tensor", "nT/m")}
 WORSE = 1.1  # times another error: clearly more
+OVERFITTED = 3.0  # the error on blocks that were not seen, over that of the fit
 DISAGREES = 3.0  # times the error on held-out blocks
 
 
@@ -161,7 +162,7 @@ def _disagreement(outcome: dict[str, Any]) -> str:
     if why := (verify or {}).get("not_possible"):
         return f"; NOT verified: {why}"
     if not verify or not held_out:
-        return ""
+        return "" if verify else _unseen(outcome["error"])
     if as_read := verify.get("total_field_as_read"):
         return f"; the verification survey's total field has no {as_read}: it is judged as it was read"
     if refuted := verify.get("not_on_this_survey"):
@@ -201,6 +202,17 @@ def _disagreement(outcome: dict[str, Any]) -> str:
             "off: noise or disturbances of its own"
         )
     return words
+
+
+def _unseen(error: dict[str, Any]) -> str:
+    """Words where blocks that the fit has not seen err far more than what it was fitted to."""
+    fit, held_out = error.get("fit") or {}, (error.get("held_out") or {}).get("after") or {}
+    own, unseen = (_of_all(e, "total_field_rms_nT") for e in (fit, held_out))
+    if not 0.0 < OVERFITTED * own < unseen:
+        return ""
+    return (
+        f"; the fit leaves {_figure(own)} nT of the samples it has seen: the survey is too short to determine it well"
+    )
 
 
 def _judged(outcome: dict[str, Any]) -> tuple[str, dict[str, Any] | None, dict[str, Any] | None]:

@@ -331,14 +331,20 @@ def _without_impossible(survey: Survey) -> tuple[Survey, dict[str, NDArray[np.bo
 
 
 def _judge_position(survey: Survey, magnitude: str, where: str, notes: list[str]) -> None:
-    """Refuse positions farther apart than a rigid array is; note sensors that share a place."""
+    """Refuse positions that are no numbers, or farther apart than a rigid array is; note sensors that share a place."""
     if "position" not in survey:
         return
     position = np.asarray(survey.values("position"), dtype=np.float64)
-    apart = np.linalg.norm(position[:, None] - position, axis=2)
-    if magnitude == "refuse" and np.nanmax(apart, initial=0.0) > checks.LARGEST_ARRAY_M:
+    if unplaced := [s for s, p in zip(survey.sensors, position, strict=True) if not np.isfinite(p).all()]:
         raise DataError(
-            f"two sensors are {np.nanmax(apart):.4g} m apart, farther than in any rigid array",
+            f"{', '.join(unplaced)}: no finite number",
+            where=f"{where}: position",
+            hint="give the place of every sensor, or of none: then there is no tensor",
+        )
+    apart = np.linalg.norm(position[:, None] - position, axis=2)
+    if magnitude == "refuse" and np.max(apart, initial=0.0) > checks.LARGEST_ARRAY_M:
+        raise DataError(
+            f"two sensors are {np.max(apart):.4g} m apart, farther than in any rigid array",
             where=f"{where}: position",
             hint="are its units right (mm labelled m)? `load: {magnitude: accept}` lets it pass",
         )

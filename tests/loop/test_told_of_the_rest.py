@@ -263,3 +263,16 @@ def test_where_another_survey_disagrees_is_told(left: float, each: dict[str, flo
     })  # fmt: skip
     assert changed in said and own in said
     assert ("disagrees" in said) is bool(changed) and ("no calibration" in said) is bool(own)
+
+
+@pytest.mark.parametrize(("unseen_nT", "told"), [(4.0, True), (0.3, False)])
+def test_a_calibration_that_does_not_carry_over_is_told(unseen_nT: float, told: bool) -> None:
+    fit, unseen = ({"total_field_rms_nT": {"all": nT}} for nT in (0.2, unseen_nT))
+    outcome = {
+        "declared": ["linear"],
+        "noise_floor_nT": 0.2,
+        "adopted": [],
+        "unexplained": {"present": False, "excess_rms_nT": 0.0, "description": "", "looks_like": []},
+        "error": {"fit": fit, "held_out": {"before": unseen, "after": unseen}},
+    }
+    assert ("the survey is too short to determine it" in sentence(outcome)) is told

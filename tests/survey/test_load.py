@@ -136,6 +136,14 @@ def test_a_thermometer_below_absolute_zero_is_refused(load_variables: Load, vari
         assert "board" in load_variables({**variables, "board": cold})
 
 
+def test_a_sensor_without_a_place_is_named(load_variables: Load, variables: Variables) -> None:
+    position = np.zeros((len(load_variables(variables).sensors), 3))
+    position[:, 0] = np.arange(len(position)) * 0.5
+    position[1, 2] = np.nan
+    with pytest.raises(DataError, match=r"position: S2: no finite number\n  .*or of none"):
+        load_variables({**variables, "position": (["sensor", "axis"], position, {"units": "m"})})
+
+
 def test_missing_and_infinite_values_are_flagged(load_variables: Load, variables: Variables) -> None:
     damaged = changed(variables, "b_raw", set_to((slice(20, 30), 1, 2), np.nan))
     damaged = changed(damaged, "b_raw", set_to((50, 3, 0), np.inf))

@@ -181,7 +181,8 @@ def existing(paths: Iterable[Path]) -> list[Path]:
     checked = list(paths)
     for path in checked:
         if not path.exists():
-            near = did_you_mean(path.name, [p.name for p in path.parent.iterdir()]) if path.parent.is_dir() else ""
+            beside = path.parent.iterdir() if path.parent.is_dir() else ()
+            near = did_you_mean(path.name, [p.name for p in beside if p.suffix == path.suffix])
             raise DataError(f"there is no such file{near}", where=str(path))
         if path.is_dir():
             raise DataError("this is a folder, a file is needed", where=str(path))
