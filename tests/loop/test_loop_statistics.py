@@ -109,6 +109,21 @@ def test_significance_is_uniform_on_white_noise() -> None:
     assert kstest(p[:, 1], "uniform", alternative="greater").pvalue > 0.001  # the largest of several: never liberal
 
 
+def test_what_all_sensors_have_alike_is_as_significant_as_what_they_have_apart() -> None:
+    """Of one sensor alone, without the others, nothing shows of it: the contrasts are those of noise."""
+    rng = np.random.default_rng(17)
+    course = np.sign(np.sin(0.2 * np.arange(1200)))
+    vector = rng.standard_normal(3)
+    record = synthetic(17, turning_s=4.0, added=0.2 * course[:, None, None] * vector * np.ones((4, 1)))
+    state = linear_state(record)
+    terms, colours = state.excitation.offsets(course, "nT").at(state.residual.samples), colours_of(state.residual)
+    blocks = grams(state.residual, terms, colours.across, colours.along, block_count(len(state.residual.affine)))
+    assert family_p(blocks, terms.sensors) < 1e-4
+    few = blocks.merged(12)
+    each = [[i for i, owner in enumerate(terms.sensors) if owner == name] for name in state.excitation.sensors]
+    assert min(wald_p(few, own, alone=range(terms.count)) for own in each) > 1e-3
+
+
 def test_one_inverse_serves_the_tests_of_all_sensors(monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(8)
     record = synthetic(9, 960, added=0.3 * flicker(rng, (960, 4, 3)))

@@ -75,6 +75,12 @@ class Own:
         """Those of some regressors."""
         return Own(self.information[which], self.noise[which])
 
+    def along(self, directions: Array) -> Own:
+        """Those of sums of regressors, whose coefficients have these directions (P, q), at most."""
+        each = self.information[:, None] * directions**2
+        whole = np.maximum(each.sum(axis=0), 1e-300)
+        return Own(np.count_nonzero(directions, axis=0) * whole, self.noise @ each / whole)
+
     @property
     def root(self) -> Array:
         """(P,) a unit of which each is measured in."""

@@ -44,14 +44,29 @@ class Jackknife:
     def own(self) -> Own:
         return own_information(self.blocks)
 
-    def p_value(self, chosen: Sequence[int], alone: Sequence[int] = (), most: int | None = None) -> float:
-        """As `statistics.wald_p`."""
+    def p_value(
+        self,
+        chosen: Sequence[int],
+        alone: Sequence[int] = (),
+        most: int | None = None,
+        within: Array | None = None,
+    ) -> float:
+        """As `statistics.wald_p`.
+
+        Parameters
+        ----------
+        within: (p, q) directions of the chosen coefficients, no others are; all where not given.
+        """
         from scipy.special import fdtrc
 
         count, terms = len(self.blocks.zz), self.blocks.count
         subset = np.asarray(chosen, dtype=int)
         (full_n, full_y), (n, y) = self._equations(subset, np.setdiff1d(np.arange(terms), [*chosen, *alone]))
-        basis, values = directions(full_n[0], self.own.of(subset))
+        own = self.own.of(subset)
+        if within is not None:
+            (full_n, full_y), (n, y) = ((within.T @ m @ within, v @ within) for m, v in ((full_n, full_y), (n, y)))
+            own = own.along(within)
+        basis, values = directions(full_n[0], own)
         basis = basis[:, np.argsort(values)[::-1][:most]]
         p = basis.shape[1]
         if p == 0 or p >= count:

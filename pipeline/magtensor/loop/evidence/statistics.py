@@ -8,6 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
+from magtensor.calibration.types import Array
 from magtensor.loop.evidence.grams import Grams
 from magtensor.loop.evidence.jackknife import Jackknife
 
@@ -32,9 +33,10 @@ class Families:
     """Tests of families of coefficients in the same blocks.
 
     For several block lengths, the largest p taken: a noise correlated for longer than the short blocks does not fool
-    the long ones. Where a family has more directions than a third of the blocks, it is tested sensor by sensor and the
-    sensors are combined (valid under any dependence). Where no block length serves a family that way, as that of a
-    source beside a hundred postures, as many of its best determined directions are tested as a third of the blocks.
+    the long ones. Where a family has more directions than a third of the blocks, it is tested sensor by sensor, and for
+    coefficients that are the same in all sensors, which one sensor without the others would not show; these tests are
+    combined (valid under any dependence). Where no block length serves a family that way, as that of a source beside a
+    hundred postures, as many of its best determined directions are tested as a third of the blocks.
 
     Attributes:
         finest: the finest blocks.
@@ -62,13 +64,23 @@ class Families:
             if 3 * len(chosen) <= count:
                 found.append(blocks.p_value(chosen))
                 continue
-            fitting = [blocks.p_value(group, alone=chosen) for group in groups if 3 * len(group) <= count]
-            if len(fitting) == len(groups) > 1:
-                found.append(cauchy_combination(fitting))
+            if len(groups) > 1 and all(3 * len(group) <= count for group in groups):
+                each = [blocks.p_value(group, alone=chosen) for group in groups]
+                if len({len(group) for group in groups}) == 1:
+                    each.append(blocks.p_value(chosen, within=_alike(chosen, groups)))
+                found.append(cauchy_combination(each))
         if not found and self._jackknives:
             finest = self._jackknives[0]
             found.append(finest.p_value(chosen, most=len(finest.blocks.zz) // 3))
         return max(found, default=1.0)
+
+
+def _alike(chosen: Sequence[int], groups: Sequence[Sequence[int]]) -> Array:
+    """(P, K) the directions in which the K coefficients of each group are those of any other."""
+    out = np.zeros((len(chosen), len(groups[0])))
+    for group in groups:
+        out[[chosen.index(i) for i in group], range(len(group))] = 1.0
+    return out
 
 
 def wald_p(g: Grams, chosen: Sequence[int], alone: Sequence[int] = (), most: int | None = None) -> float:
