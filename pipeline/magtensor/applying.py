@@ -8,6 +8,8 @@ from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from magtensor import provenance, result
 from magtensor.accuracy import figure, left_by_any_calibration
 from magtensor.atomic import refuse_overwriting, require_writable
@@ -21,7 +23,7 @@ from magtensor.survey.model import Survey, Variable
 from magtensor.verdict import WORSE, survey_block
 
 if TYPE_CHECKING:
-    from magtensor.calibration.types import ArrayCalibration
+    from magtensor.calibration.types import Array, ArrayCalibration
     from magtensor.loop.fitting.model import Adopted
     from magtensor.platform_frame import Tied
 
@@ -99,9 +101,12 @@ def apply(
         "extrapolated": "extrapolated",
         "taken to go straight": "bridged",
         "begins anew with this survey": "begins_anew",
+        "held as it was when what is known of it ended": "held",
         "otherwise than the dates say, as this survey's own outputs show": "not_as_dated",
         "taken to begin in equilibrium, which four sensors of known positions would show": "in_equilibrium",
         "NOT taken off, for the lengths of this survey's vectors refute it": "not_on_this_survey",
+        "NOT measuring the field that the others measure, to a tenth of it": "strangers",
+        "as if turned since the calibration, which makes the tensor wrong": "turned_since",
         "taken off, though |b| would be nearer to this survey's total field without": "contradicted",
     }
     told_of = (f"{what}: {attributes[name]}" for what, name in each.items() if name in attributes)
@@ -184,6 +189,7 @@ def apply_and_refine(
         bridged,
         cleaned,
         contradicted_here,
+        held,
         in_equilibrium,
         not_as_dated,
         on_its_clock,
@@ -232,6 +238,7 @@ def apply_and_refine(
             "bridged": bridged(before, adopted),
             "begins_anew": begun_anew(adopted, calibration),
             "not_as_dated": not_as_dated(adopted, survey),
+            "held": held(adopted, survey),
             "in_equilibrium": in_equilibrium(adopted, survey),
             "not_on_this_survey": here.refuted,
         }
@@ -240,10 +247,13 @@ def apply_and_refine(
             survey = as_read
             names = ", ".join(a.name for a in adopted if a.component.effect == "reference")
             given = corrected(fitted, survey, **words, total_field_as_read=names)
-        doubted = ""
+        doubts: dict[str, str] = {}
         if rows is None and judge:
-            doubted = contradicted_here(before, survey, as_fitted(calibration, fitted), adopted, theta, origins)
-        survey = survey.merged(_named(given, calibration, dated, apart, doubted))
+            doubts = _disagreeing(np.asarray(given["calibrated/b"][1]), survey)
+            doubts["contradicted"] = contradicted_here(
+                before, survey, as_fitted(calibration, fitted), adopted, theta, origins
+            )
+        survey = survey.merged(_named(given, calibration, dated, apart, doubts))
         if refine_rotation:
             survey, turned = with_refined_rotation(survey, calibration, fitted)
             if turned is not None:  # as it is kept, it holds the scatter beside the covariance
@@ -273,19 +283,30 @@ def apply_and_refine(
 
 
 def _named(
-    given: dict[str, Variable], calibration: Survey, dated: str, scatter: float, doubted: str
+    given: dict[str, Variable], calibration: Survey, dated: str, scatter: float, doubts: dict[str, str]
 ) -> dict[str, Variable]:
     """The variables of a calibrated survey, with the words that say whose offsets were taken off, by how many nT they
-    scatter about this survey's, the date that the calibration was brought to, and which effects the survey's own total
-    field contradicts."""
+    scatter about this survey's, the date that the calibration was brought to, and what the survey itself says against
+    them."""
     from magtensor.offsets_apart import for_another
 
     whose = for_another(str(calibration["calibration/matrix"].attrs.get("offset_of", "")), scatter)
-    words = {
-        "offset_of": whose, "calibration_date": dated, "offset_scatter_nT": scatter, "contradicted": doubted,
-    }  # fmt: skip
+    words = {"offset_of": whose, "calibration_date": dated, "offset_scatter_nT": scatter, **doubts}
     dims, values, attributes = given["calibrated/b"]
     return given | {"calibrated/b": (dims, values, dict(attributes) | {k: v for k, v in words.items() if v})}
+
+
+def _disagreeing(b: Array, survey: Survey) -> dict[str, str]:
+    """Words for sensors that do not see what the others see: turned since the calibration, or not measuring at all."""
+    from magtensor.calibration.agreement import strangers, turns
+
+    good = survey.good_by_sensor
+    total = survey.values("total_field") if "total_field" in survey else np.median(np.linalg.norm(b, axis=2), axis=1)
+    if far := strangers(b, good, total):
+        named = (f"{survey.sensors[s]} (in {part:.0%} of the samples)" for s, part in far.items())
+        return {"strangers": ", ".join(named)}
+    turned = turns(b, good)
+    return {"turned_since": ", ".join(f"{survey.sensors[s]} by {angle:.2g} deg" for s, angle in turned.items())}
 
 
 def _told(attributes: Mapping[str, Any]) -> str:
@@ -309,7 +330,8 @@ def verification(calibrated: Survey, path: Path | Held, planned: Plan) -> dict[s
     `total_field_as_read` names errors of the base station that were left in (`_better_as_read`), `contradicted`
     effects without which |b| would be nearer to the survey's total field, `extrapolated` those that the survey
     takes beyond what the calibration has seen, `not_on_this_survey` those that its lengths refute, which were left
-    in, and `left_by_any_calibration_nT` is what of |b| - F no other calibration of the sensors would take off.
+    in, `strangers` and `turned_since` sensors that do not see what the others see, and `left_by_any_calibration_nT` is
+    what of |b| - F no other calibration of the sensors would take off.
     """
     corrected = apply_to(calibrated, path, planned, uniform=True)
     after = survey_block(corrected)
@@ -322,7 +344,10 @@ def verification(calibrated: Survey, path: Path | Held, planned: Plan) -> dict[s
         each = corrected.values("calibrated/b"), corrected.values("total_field"), corrected.good_by_sensor
         found["left_by_any_calibration_nT"] = left_by_any_calibration(*each)
     attributes = corrected["calibrated/b"].attrs
-    told = ("not_taken_off", "not_on_this_survey", "total_field_as_read", "contradicted", "extrapolated")
+    told = (
+        "not_taken_off", "not_on_this_survey", "total_field_as_read", "contradicted", "extrapolated", "strangers",
+        "turned_since",
+    )  # fmt: skip
     return found | {name: attributes[name] for name in told if name in attributes}
 
 

@@ -97,9 +97,10 @@ def corrected(calibration: ArrayCalibration, survey: Survey, **words: str) -> di
     `extrapolated` those taken off beyond what the calibration has seen, `bridged` those that follow a channel which is
     missing for a while, `begins_anew` those of a time that goes on from the calibration's survey to another one as a
     rule, and with this one began again, `not_as_dated` those that had happened before it, or not yet, though the
-    dates say otherwise, `in_equilibrium` responses that lag and are taken to have begun so, `not_on_this_survey` those
-    that the survey's own outputs refute, `total_field_as_read` those of the base station that were left in its total
-    field, `contradicted` those without which |b| would be nearer to it.
+    dates say otherwise, `held` those that stay as they were when what is known of them ended, `in_equilibrium`
+    responses that lag and are taken to have begun so, `not_on_this_survey` those that the survey's own outputs refute,
+    `total_field_as_read` those of the base station that were left in its total field, `contradicted` those without
+    which |b| would be nearer to it.
     """
     raw = np.asarray(survey.values("b_raw"), dtype=float)
     b = calibration.apply(raw)

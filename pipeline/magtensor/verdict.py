@@ -163,6 +163,10 @@ def _disagreement(outcome: dict[str, Any]) -> str:
         return f"; NOT verified: {why}"
     if not verify or not held_out:
         return "" if verify else _unseen(outcome["error"])
+    if far := verify.get("strangers"):
+        return f"; on the verification survey {far} differs from the others by more than a tenth of the field"
+    if turned := verify.get("turned_since"):
+        return f"; on the verification survey the sensors differ as if they had been turned since: {turned}"
     if as_read := verify.get("total_field_as_read"):
         return f"; the verification survey's total field has no {as_read}: it is judged as it was read"
     if refuted := verify.get("not_on_this_survey"):

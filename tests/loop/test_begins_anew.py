@@ -79,7 +79,10 @@ def test_a_drift_that_goes_on_does_not_begin_anew(tmp_path: Path) -> None:
     whole = survey_file(tmp_path, scenario(5, {"type": "offset_drift", "rms_nT": 1.2}), "whole.h5")
     done = magtensor.close_loop(half(whole, second=False), search=["offset_drift"])
     assert [a["error_model"] for a in done.verdict["adopted"]] == ["offset_drift"]
-    assert "begins_anew" not in done.calibration.apply(half(whole, second=True))["calibrated/b"].attrs
+    told = done.calibration.apply(half(whole, second=True))["calibrated/b"].attrs
+    assert "begins_anew" not in told
+    assert told["held"] == "offset_drift (for 600 s)"
+    assert "held" not in done.calibration.apply(half(whole, second=False))["calibrated/b"].attrs
 
 
 @pytest.mark.parametrize("effect", [DRIFT, STEP], ids=lambda e: str(e["type"]))

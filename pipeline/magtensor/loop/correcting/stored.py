@@ -139,6 +139,19 @@ def not_as_dated(adopted: Sequence[Adopted], survey: Survey) -> str:
     return ", ".join(dict.fromkeys(words))
 
 
+def held(adopted: Sequence[Adopted], survey: Survey) -> str:
+    """Which effects stay as they were when what is known of them ended, and for how long; "" where none does."""
+    words = []
+    for a in adopted:
+        known = [float(a.settings[n]) for n, mark in profiled(a.component).items() if isinstance(mark, Duration)]
+        if a.start is None or not known or abs(late := a.start - float(survey.time[0])) >= LONG:
+            continue
+        beyond = float(survey.time[-1] - survey.time[0]) - late - max(known)
+        if beyond > LONG_PART * max(known):
+            words.append(f"{a.name} (for {beyond:.0f} s)")
+    return ", ".join(dict.fromkeys(words))
+
+
 def in_equilibrium(adopted: Sequence[Adopted], survey: Survey) -> str:
     """Which responses that lag are taken to begin in equilibrium, for the survey does not show what they began with; ""
     where none is."""
