@@ -10,7 +10,7 @@ import pytest
 from loop_cases import Array, linear_state, looked_at, synthetic
 
 from magtensor.loop.fitting.model import Adopted, Fitting, Record
-from magtensor.loop.fitting.refit import joint_state
+from magtensor.loop.fitting.refit import joint_state, loud_stretches, rounding
 from magtensor.loop.remainder.flagged import flagged_words
 from magtensor.loop.remainder.predictable import converter_words
 from magtensor.loop.searching.found import Search, Step
@@ -263,6 +263,18 @@ def test_where_another_survey_disagrees_is_told(left: float, each: dict[str, flo
     })  # fmt: skip
     assert changed in said and own in said
     assert ("disagrees" in said) is bool(changed) and ("no calibration" in said) is bool(own)
+
+
+def test_outputs_in_coarse_steps_have_no_loud_stretches() -> None:
+    """Between postures everything changes, at rest next to nothing does: that is no noise that is louder."""
+    clean = synthetic(5, SAMPLES, turning_s=4.0, noise_nT=0.15)
+    at_rest = np.repeat(clean.raw[::20], 20, axis=0) + 0.15 * np.random.default_rng(5).standard_normal(clean.raw.shape)
+    coarse = replace(clean, raw=np.round(at_rest / 2.0) * 2.0)
+    state = linear_state(coarse)
+    assert loud_stretches(coarse, state, Fitting()) == ()
+    (words,) = loud_words(state, coarse, Fitting())
+    assert words == "the outputs come in steps of 2 nT, and rounding makes more of what is left than noise"
+    assert rounding(clean, linear_state(clean)) == 0.0
 
 
 @pytest.mark.parametrize(("unseen_nT", "told"), [(4.0, True), (0.3, False)])

@@ -253,8 +253,19 @@ def _fit(
     return fit if np.array_equal(more, fit.keep) else fitted(more)
 
 
+def rounding(record: Record, state: State) -> float:
+    """nT, the steps that the outputs come in, where rounding makes more of them than the noise does; 0 elsewhere."""
+    from magtensor.survey.recorded_numbers import resolution
+
+    outputs = record.raw.reshape(len(record.raw), -1)
+    step = float(np.median([resolution(output) for output in outputs.T]))
+    return step if step**2 / 12.0 > float(np.median(state.residual.noise)) ** 2 else 0.0
+
+
 def loud_stretches(record: Record, state: State, how: Fitting) -> tuple[tuple[float, float], ...]:
     """s, from when to when the noise is so loud that the calibration is better without these samples."""
+    if rounding(record, state):
+        return ()  # outputs that are repeated tell no noise
     each = [a.terms(state.excitation) for a in state.adopted]
     raw, reference = without(record, each, state.theta)
     assert reference is not None

@@ -19,7 +19,7 @@ from magtensor.loop.evidence.residual import Residual, residual_of
 from magtensor.loop.evidence.spectrum import spectral_lines
 from magtensor.loop.evidence.stretches import ABOUT, LEAST_LOUD
 from magtensor.loop.fitting.model import Fitting, Record, State
-from magtensor.loop.fitting.refit import disturbed, without
+from magtensor.loop.fitting.refit import disturbed, rounding, without
 from magtensor.loop.remainder.changing_matrix import changing_matrices
 from magtensor.loop.remainder.excess import excess_rms
 from magtensor.loop.remainder.flagged import (
@@ -190,6 +190,8 @@ def loud_words(state: State, record: Record, how: Fitting) -> list[str]:
     """Where the noise of a sensor is louder for a while: no effect, but worth a look."""
     from scipy.ndimage import median_filter
 
+    if step := rounding(record, state):
+        return [f"the outputs come in steps of {step:.3g} nT, and rounding makes more of what is left than noise"]
     if state.residual.across is None or len(state.residual.across) < 4 * LEAST_LOUD:
         return []
     seen = state.residual
