@@ -98,7 +98,8 @@ class _Compared:
         name: what it follows.
         channel, time: squares that it explains beside them, and they beside it, more than noise would.
         whole: that it explains without them.
-        seen, of_time: whether noise would not.
+        seen, of_time: whether noise would not; and, for them, whether these courses with the coefficients of the
+            channel would not be noise either.
     """
 
     name: str
@@ -119,7 +120,10 @@ def _compared(model: Adopted, theta: Array, before: State) -> _Compared | None:
     residual, given = thinned(before, REFINING_SAMPLES)
     held = [] if given is None else [given]
     own = _with_slopes(model, theta, x).at(residual.samples)
-    courses = _of_time(model, x, name).at(residual.samples)
+    apart = _of_time(model, x, name)
+    courses = joined(apart).at(residual.samples)
+    alike = courses if name == THE_FIELD else _of_its_pattern(apart, theta, x).at(residual.samples)
+    station = joined([x.on_reference(course, "nT", "") for course in _courses(x).T]).at(residual.samples)
     every = joined([*held, own, courses])
     left = taken_off(residual, every, estimated(residual, every, WHITE).theta)
     colours = colours_of(left, stiff=True, above=FIRST_LEFT)
@@ -131,13 +135,14 @@ def _compared(model: Adopted, theta: Array, before: State) -> _Compared | None:
 
     channel = explains(residual, own, courses) - explains(residual, courses)
     time = explains(between, own, courses) - explains(between, own)
+    pattern = explains(residual, own, station, alike) - explains(residual, own, station)
     return _Compared(
         name,
         channel - own.count,
         time - courses.count,
         explains(residual, own) - (explains(residual) if held else 0.0),
         _chance(channel, own.count) < SEEN,
-        _chance(time, courses.count) < MORE,
+        _chance(time, courses.count) < MORE and _chance(pattern, alike.count) < SEEN,
     )
 
 
@@ -170,12 +175,17 @@ def _with_slopes(model: Adopted, theta: Array, x: Excitation) -> Terms:
     return joined([here, *slopes])
 
 
-def _of_time(model: Adopted, x: Excitation, name: str) -> Terms:
-    """What a model makes of smooth courses of time in the place of its channel; of the field, offsets."""
+def _courses(x: Excitation) -> Array:
+    """(N, K) smooth courses of time."""
     part = (x.time - x.time[0]) / max(x.duration, 1e-300)
-    courses = np.polynomial.legendre.legvander(2.0 * np.sqrt(part) - 1.0, COURSES)[:, 1:]
+    return np.asarray(np.polynomial.legendre.legvander(2.0 * np.sqrt(part) - 1.0, COURSES)[:, 1:])
+
+
+def _of_time(model: Adopted, x: Excitation, name: str) -> list[Terms]:
+    """What a model makes of each smooth course of time in the place of its channel; of the field, offsets."""
+    courses = _courses(x)
     if name == THE_FIELD:
-        return joined([x.offsets(course, "nT") for course in courses.T])
+        return [x.offsets(course, "nT") for course in courses.T]
     settings = _plain(model)
     shape = x.logged[name].shape
     made = []
@@ -183,7 +193,17 @@ def _of_time(model: Adopted, x: Excitation, name: str) -> Terms:
         logged = np.broadcast_to(course.reshape(-1, *(1,) * (len(shape) - 1)), shape)
         seen = replace(x, logged={**x.logged, name: logged}, courses={})
         made.append(replace(model, settings=settings).terms(seen))
-    return joined(made)
+    return made
+
+
+def _of_its_pattern(courses: Sequence[Terms], theta: Array, x: Excitation) -> Terms:
+    """The same with the coefficients that the channel has: one cause that follows another course of time would have
+    these, and slow noise, each output's own, has not."""
+    outputs = 3 * len(x.sensors)
+    if courses[0].count > len(theta):
+        return joined(list(courses))
+    made = (terms.contribution(theta[: terms.count], outputs) for terms in courses)
+    return joined([one_pattern(series, f"course {k}") for k, series in enumerate(made)])
 
 
 def _plain(model: Adopted) -> Mapping[str, Any]:
