@@ -13,7 +13,7 @@ from loop_cases import linear_state, looked_at, scenario, synthetic, verdict_of
 
 from magtensor.loop.fitting.model import Adopted, Fitting
 from magtensor.loop.fitting.refit import joint_state
-from magtensor.loop.searching.like_a_station import as_a_station_would
+from magtensor.loop.searching.like_a_station import as_a_station_would, turns_with_the_platform
 from magtensor.loop.searching.own_fit import plainer_forms
 from magtensor.registry import Registry
 
@@ -55,6 +55,18 @@ def test_one_offset_of_all_sensors_turns_with_the_platform_if_that_turns(turning
 def test_what_every_sensor_has_alike_is_found_where_the_platform_turns(effect: dict[str, Any], tmp_path: Path) -> None:
     told = verdict_of(tmp_path, scenario(5, effect))
     assert [a["error_model"] for a in told["adopted"]] == [effect["type"]]
+
+
+@pytest.mark.parametrize("of_the_station", [False, True])
+def test_a_field_of_the_platform_turns_and_an_error_of_the_station_does_not(of_the_station: bool) -> None:
+    course = np.sin(np.arange(1200) / 25.0) + np.sin(np.arange(1200) / 40.0) ** 3
+    vector = np.array([3.0, -2.0, 2.0])
+    added = None if of_the_station else np.repeat((course[:, None] * vector)[:, None], 4, axis=1)
+    record = synthetic(31, turning_s=4.0, added=added)
+    if of_the_station:
+        assert record.total_field is not None
+        record = replace(record, total_field=record.total_field + 4.0 * course)
+    assert turns_with_the_platform(linear_state(record)) is not of_the_station
 
 
 def test_a_base_station_that_follows_the_temperature_is_no_fault_of_the_sensors(tmp_path: Path) -> None:

@@ -1,4 +1,7 @@
-"""Whether an error of the base station would look the same as an adopted model."""
+"""Whether an error of the base station would look the same as an adopted model, or as what is left of |b| - F.
+
+What a vector in the sensors' axes makes of it turns with the platform, and no error of a station does.
+"""
 
 from __future__ import annotations
 
@@ -9,15 +12,19 @@ import numpy as np
 from magtensor.calibration.types import Array
 from magtensor.error_models.excitation import Excitation
 from magtensor.error_models.terms import Terms, joined
-from magtensor.loop.evidence.assessment import Colours, estimated_in, explained
+from magtensor.loop.evidence.assessment import Colours, estimated, estimated_in, explained
 from magtensor.loop.evidence.grams import Whitened
 from magtensor.loop.evidence.residual import Residual
 from magtensor.loop.fitting.model import Adopted, State
+from magtensor.loop.searching.beginnings import one_pattern
 from magtensor.loop.searching.contribution import put_back, slices
 
 APART_ALPHA = 1e-4  # what no station does has to be as unlikely by chance
 A_PART = 0.1  # of what a model explains of |b| - F has to be none of a station's
 COURSES = 20  # half waves over the survey: what a station does slowly, whatever the cause
+MORE_COURSES = 40  # the same of what is left, of which nobody knows how fast it is
+EACH = 20  # samples at least for each of them
+MOSTLY = 0.5  # of what is left turns with the platform
 
 
 def as_a_station_would(state: State, place: int) -> bool:
@@ -42,14 +49,39 @@ def as_a_station_would(state: State, place: int) -> bool:
     return by_chance > APART_ALPHA or turning < A_PART * either
 
 
+def turns_with_the_platform(state: State) -> bool:
+    """Whether most of what is left of |b| - F is what a field fixed to the platform would make, whatever its course."""
+    residual, x = state.residual, state.excitation
+    count = min(MORE_COURSES, len(residual.samples) // EACH)
+    if residual.along is None or not count:
+        return False
+    slow = _half_waves(x, count)
+    fixed = joined([one_pattern(_on_all(x, axis, course), f"{axis}") for axis in range(3) for course in slow.T])
+    station = joined([x.on_reference(course, "nT", "") for course in slow.T])
+    fixed, station = fixed.at(residual.samples), station.at(residual.samples)
+    along, given = replace(residual, across=None), [] if state.terms is None else [state.terms]
+    turning, by_chance = _beyond(along, state.colours, fixed, [*given, station])
+    either = turning + _beyond(along, state.colours, station, given)[0]
+    return by_chance < APART_ALPHA and turning > MOSTLY * either
+
+
+def _on_all(x: Excitation, axis: int, course: Array) -> Array:
+    """(N, 3 S) outputs of a field along an axis of the platform with a course (N,)."""
+    return np.asarray(course[:, None] * x.matrix[:, :, axis].ravel())
+
+
+def _half_waves(x: Excitation, count: int) -> Array:
+    elapsed = (x.time - x.time[0]) / max(x.duration, 1e-9)
+    return np.asarray(np.cos(np.pi * np.outer(elapsed, np.arange(1, count + 1))))
+
+
 def _of_a_station(x: Excitation, model: Adopted) -> Terms:
     """Courses of the total field that all sensors see alike: slow ones, and those of a model's channels as they are
     logged and as it follows them, with their squares."""
-    elapsed = (x.time - x.time[0]) / max(x.duration, 1e-9)
-    slow = np.cos(np.pi * np.outer(elapsed, np.arange(1, COURSES + 1)))
     lag = float(model.settings.get("lag_s", 0.0))
-    courses = [slow, *(_powers(x.channel(c, s)) for c in sorted(model.channels(x)) for s in dict.fromkeys((0.0, lag)))]
-    return joined([x.on_reference(course, "nT", str(i)) for i, course in enumerate(np.hstack(courses).T)])
+    followed = [_powers(x.channel(c, s)) for c in sorted(model.channels(x)) for s in dict.fromkeys((0.0, lag))]
+    courses = np.hstack([_half_waves(x, COURSES), *followed])
+    return joined([x.on_reference(course, "nT", "") for course in courses.T])
 
 
 def _powers(channel: Array) -> Array:
@@ -63,6 +95,9 @@ def _beyond(residual: Residual, colours: Colours, terms: Terms, given: list[Term
     """What terms explain beside the given ones, in noise of unit variance, and how likely chance explains as much."""
     from scipy.special import chdtrc
 
+    if not given:
+        alone = estimated(residual, terms, colours)
+        return explained(alone), float(chdtrc(max(alone.rank, 1), explained(alone)))
     white = Whitened.of(residual, colours.across, colours.along, joined(given), over_time=False)
     with_them, without = estimated_in(white, terms), estimated_in(white, None)
     gained, rank = max(explained(with_them) - explained(without), 0.0), with_them.rank - without.rank

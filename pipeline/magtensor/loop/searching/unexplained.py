@@ -39,6 +39,7 @@ from magtensor.loop.remainder.sparse_readings import SparseReadings, sparse_read
 from magtensor.loop.remainder.tones import of_the_turning
 from magtensor.loop.searching.found import Search
 from magtensor.loop.searching.latent import shared_words
+from magtensor.loop.searching.like_a_station import turns_with_the_platform
 from magtensor.loop.searching.suspects import Suspects
 from magtensor.sharing import shared_out
 
@@ -128,7 +129,11 @@ def _what_shows(found: Search, record: Record, excess: float, sparse: SparseRead
     if (slow := slow_along(state)) > max(MUCH * state.residual.scale, TWICE * noise):
         alike = _seen_alike(state.residual)
         where = "in all sensors alike" if alike else "in their mean"
-        cause = ": an error of the base station, or a field at the site that it does not see" if alike else ""
+        cause = ""
+        if alike and turns_with_the_platform(state):
+            cause = ": it turns with the platform, as the field of something on it that no channel logs"
+        elif alike:
+            cause = ": an error of the base station, or a field that it does not see, of the site or of the platform"
         words.append(f"{slow:.3g} nT rms of |b| - F, {where}, is no white noise{cause}")
     return words
 
