@@ -17,7 +17,7 @@ from magtensor.loop.fitting.errors_before_after import folds_for
 from magtensor.loop.fitting.model import Adopted, Fitting, Record, State
 from magtensor.loop.fitting.refit import joint_state
 from magtensor.loop.searching.gates import OF_THE_LAW, Candidate
-from magtensor.loop.searching.kin import drivers, explained_by_kin
+from magtensor.loop.searching.kin import drivers, explained_by_kin, may_be_its_law
 from magtensor.registry import Registry
 
 COURSE = np.sin(np.arange(1200) / 200.0)
@@ -55,14 +55,31 @@ def test_kin_have_one_driver_and_one_sensor() -> None:
     record = logged(synthetic(92, added=added))
     offset = replace(model("temperature_offset", channel="temperature"), sensors=("S2",))
     state = joint_state(record, [offset], Fitting())
-    scale = model("temperature_scale", channel="temperature")
+    rate = model("temperature_rate", channel="temperature", tau_s=10.0)
     current = model("current_field", channel="current_pump")
-    of_the_same = explained_by_kin(state, scale, *assessed(state, scale, "S2"))
+    of_the_same = explained_by_kin(state, rate, *assessed(state, rate, "S2"))
     # three of four parts of what is added lie off the field that all sensors see, and a little along it
     assert of_the_same == pytest.approx(np.sum(added**2) * 0.75, rel=0.3)
-    assert explained_by_kin(state, scale, *assessed(state, scale, "S3")) == 0.0  # another sensor
+    assert explained_by_kin(state, rate, *assessed(state, rate, "S3")) == 0.0  # another sensor
     assert explained_by_kin(state, current, *assessed(state, current, "S2")) == 0.0  # another driver
     assert explained_by_kin(state, offset, *assessed(state, offset, "S2")) == 0.0  # more of the same has another lag
+
+
+@pytest.mark.parametrize("kin", [False, True])
+def test_what_turns_is_no_law_of_an_offset_unless_the_platform_hardly_does(kin: bool) -> None:
+    added = np.zeros((1200, 4, 3))
+    added[:, 1] = 20.0 * COURSE[:, None]
+    plain = synthetic(94)
+    if kin:  # turned by a degree or two about one attitude
+        field = plain.raw.mean(axis=(0, 1)) + 0.02 * plain.raw
+        plain = replace(plain, raw=field + np.array([20_000.0, 10_000.0, 40_000.0]))
+    record = logged(replace(plain, raw=plain.raw + added))
+    offset = replace(model("temperature_offset", channel="temperature"), sensors=("S2",))
+    found = replace(linear_state(logged(synthetic(94))), adopted=(offset,))
+    x = replace(found.excitation, output=record.raw)
+    turned = model("temperature_scale", channel="temperature").terms(x).at(found.residual.samples)
+    theta = np.array([1.0 if s == "S2" else 0.0 for s in turned.sensors])
+    assert may_be_its_law(offset, turned, theta, replace(found, excitation=x)) is kin
 
 
 def test_an_event_beside_a_response_that_has_no_law_is_of_its_kind() -> None:

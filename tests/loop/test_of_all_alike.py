@@ -10,10 +10,15 @@ import h5py
 import numpy as np
 import pytest
 from loop_cases import linear_state, looked_at, scenario, synthetic, verdict_of
+from scipy.ndimage import gaussian_filter1d
 
 from magtensor.loop.fitting.model import Adopted, Fitting
 from magtensor.loop.fitting.refit import joint_state
-from magtensor.loop.searching.like_a_station import as_a_station_would, turns_with_the_platform
+from magtensor.loop.searching.like_a_station import (
+    as_a_station_would,
+    channels_of_the_total_field,
+    turns_with_the_platform,
+)
 from magtensor.loop.searching.own_fit import plainer_forms
 from magtensor.registry import Registry
 
@@ -67,6 +72,21 @@ def test_a_field_of_the_platform_turns_and_an_error_of_the_station_does_not(of_t
         assert record.total_field is not None
         record = replace(record, total_field=record.total_field + 4.0 * course)
     assert turns_with_the_platform(linear_state(record)) is not of_the_station
+
+
+def test_channels_that_the_base_station_alone_does_not_see_are_named() -> None:
+    """A regional gradient along the track, and a channel that has nothing to do with it."""
+    rng = np.random.default_rng(33)
+    east, north, other = gaussian_filter1d(rng.standard_normal((3, 1200)), 15.0) * 10.0
+    plain = synthetic(33, turning_s=4.0)
+    assert plain.total_field is not None
+    logged = {"east": east - east.mean(), "north": north - north.mean(), "other": other - other.mean()}
+    record = replace(
+        plain, logged=logged, origins=dict.fromkeys(logged, np.zeros(())), units=dict.fromkeys(logged, "m")
+    )
+    assert channels_of_the_total_field(linear_state(record), 1e-3) == []
+    beside = replace(record, total_field=plain.total_field + 3.0 * east - 2.0 * north)
+    assert set(channels_of_the_total_field(linear_state(beside), 1e-3)) == {"east", "north"}
 
 
 def test_a_base_station_that_follows_the_temperature_is_no_fault_of_the_sensors(tmp_path: Path) -> None:

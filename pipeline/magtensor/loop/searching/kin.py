@@ -2,7 +2,9 @@
 
 The law of an effect holds to some per cent: a scale factor that follows the temperature may turn with it a little, an
 axis that leans takes its share of a drift. What follows the same channel, or goes with time as well, on the same
-sensors, and is that small beside it, is more of the same and no second cause.
+sensors, and is that small beside it, is more of the same and no second cause. Not what turns with the field beside what
+is added to the axes, nor the other way round: whatever law an offset has, it does not turn, unless the platform hardly
+does.
 """
 
 from __future__ import annotations
@@ -12,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from magtensor.calibration.types import Array
 from magtensor.error_models.excitation import Excitation
 from magtensor.error_models.needs import FACTS
 from magtensor.error_models.settings import Duration, EventTimes, Range, profiled
@@ -22,6 +25,7 @@ from magtensor.loop.searching.contribution import a_tone, happens_once, moments
 from magtensor.loop.searching.gates import Candidate, explained_by, seen_between
 
 MOST = 0.5  # of what a candidate explains
+POWERS = 6  # of time and of a channel: more than any law of an effect that has a name
 NEXT = 2  # samples: that a jump seems to be away while another part of it has no name
 MISSED = 0.01  # of the squares of an event that is held by another: some samples between the two
 TIME = " time"  # no channel has that name
@@ -79,8 +83,41 @@ def _explained(
         and not (between and other.component.effect == "reference")
         and (by & drivers(other, state.excitation) or (generic(other) and happens_once(model)))
         and _held_by(other.sensors or state.excitation.sensors, state, terms, assessment) > NEARLY_ALL
+        and may_be_its_law(other, terms, theta, state)
     ]
     return explained_by(state, kin) if kin else 0.0
+
+
+def may_be_its_law(other: Adopted, terms: Terms, theta: Array, state: State) -> bool:
+    """Whether what a candidate adds to the outputs may be what the law of an adopted effect misses, whatever course of
+    its channel and of time that is: only where both are added to the axes, or both turn with the field, or most of the
+    one is seen as the other."""
+    x, samples = state.excitation, state.residual.samples
+    theirs = other.terms(x).at(samples)
+    if terms.adds_to_axes == theirs.adds_to_axes:
+        return True
+    outputs = len(state.residual.noise)
+    added = terms.contribution(theta, outputs)
+    courses = _courses(other, x)[samples]
+    whole = left = 0.0
+    for number, series in enumerate(added.T):
+        own = np.ones(len(samples)) if theirs.adds_to_axes else x.output[samples].reshape(len(samples), -1)[:, number]
+        free = np.column_stack([np.ones(len(samples)), x.output[samples, number // 3]])  # what C and o take
+        left_of, made = (
+            each - free @ np.linalg.lstsq(free, each, rcond=None)[0] for each in (series, courses * own[:, None])
+        )
+        whole += float(left_of @ left_of)
+        left += float(np.sum((left_of - made @ np.linalg.lstsq(made, left_of, rcond=1e-9)[0]) ** 2))
+    return left < (1.0 - MOST) * whole
+
+
+def _courses(model: Adopted, x: Excitation) -> Array:
+    """(N, K) smooth courses of time, and powers of the channels of a model."""
+    names = sorted(model.channels(x) | {need for need in model.component.declared({}).needs if need in x.logged})
+    logged = (np.nan_to_num(x.channel(name)).reshape(len(x.time), -1).T for name in names)
+    series = [x.elapsed, *(channel for several in logged for channel in several)]
+    spans = [(s - s.min()) / max(float(np.ptp(s)), 1e-300) * 2.0 - 1.0 for s in series]
+    return np.hstack([np.polynomial.legendre.legvander(s, POWERS)[:, 1:] for s in spans])
 
 
 def drivers(model: Adopted, x: Excitation) -> set[str]:

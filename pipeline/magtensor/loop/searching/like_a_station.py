@@ -12,7 +12,7 @@ import numpy as np
 from magtensor.calibration.types import Array
 from magtensor.error_models.excitation import Excitation
 from magtensor.error_models.terms import Terms, joined
-from magtensor.loop.evidence.assessment import Colours, estimated, estimated_in, explained
+from magtensor.loop.evidence.assessment import WHITE, Colours, assess, estimated, estimated_in, explained
 from magtensor.loop.evidence.grams import Whitened
 from magtensor.loop.evidence.residual import Residual
 from magtensor.loop.fitting.model import Adopted, State
@@ -24,7 +24,8 @@ A_PART = 0.1  # of what a model explains of |b| - F has to be none of a station'
 COURSES = 20  # half waves over the survey: what a station does slowly, whatever the cause
 MORE_COURSES = 40  # the same of what is left, of which nobody knows how fast it is
 EACH = 20  # samples at least for each of them
-MOSTLY = 0.5  # of what is left turns with the platform
+MOST_CHANNELS = 3
+MOSTLY = 0.5  # of what is left, beside white noise, turns with the platform
 
 
 def as_a_station_would(state: State, place: int) -> bool:
@@ -50,7 +51,8 @@ def as_a_station_would(state: State, place: int) -> bool:
 
 
 def turns_with_the_platform(state: State) -> bool:
-    """Whether most of what is left of |b| - F is what a field fixed to the platform would make, whatever its course."""
+    """Whether most of what is left of |b| - F is what a field fixed to the platform would make, whatever its course,
+    and no course of all sensors alike."""
     residual, x = state.residual, state.excitation
     count = min(MORE_COURSES, len(residual.samples) // EACH)
     if residual.along is None or not count:
@@ -59,10 +61,34 @@ def turns_with_the_platform(state: State) -> bool:
     fixed = joined([one_pattern(_on_all(x, axis, course), f"{axis}") for axis in range(3) for course in slow.T])
     station = joined([x.on_reference(course, "nT", "") for course in slow.T])
     fixed, station = fixed.at(residual.samples), station.at(residual.samples)
-    along, given = replace(residual, across=None), [] if state.terms is None else [state.terms]
-    turning, by_chance = _beyond(along, state.colours, fixed, [*given, station])
-    either = turning + _beyond(along, state.colours, station, given)[0]
-    return by_chance < APART_ALPHA and turning > MOSTLY * either
+    given = [] if state.terms is None else [state.terms]
+    turning = _beyond(replace(residual, across=None), WHITE, fixed, [*given, station])[0]
+    return turning > MOSTLY * (float(np.sum(residual.along**2)) - len(residual.along))
+
+
+def channels_of_the_total_field(state: State, alpha: float) -> list[str]:
+    """Logged channels that what is left of |b| - F follows, alike in all sensors, in the order of what they explain
+    beside each other; at most so many as tell what it is.
+
+    Parameters
+    ----------
+    alpha: probability that noise alone makes any follow it.
+    """
+    x, residual = state.excitation, replace(state.residual, across=None)
+    open_ = {name: c for name, c in x.logged.items() if np.ndim(c) == 1 and np.isfinite(c).all() and np.ptp(c) > 0}
+    found: list[str] = []
+    given = [] if state.terms is None else [state.terms]
+    while residual.along is not None and open_ and len(found) < MOST_CHANNELS:
+        white = Whitened.of(residual, state.colours.across, state.colours.along, joined(given) if given else None)
+        terms = {name: x.on_reference(c / np.std(c), "nT", name).at(residual.samples) for name, c in open_.items()}
+        each = {name: assess(white, own) for name, own in terms.items()}
+        best = max(each, key=lambda name: each[name].gain.total)
+        if not (each[best].p * len(x.logged) < alpha and each[best].gain.consistent):
+            break
+        found.append(best)
+        given.append(terms[best])
+        del open_[best]
+    return found
 
 
 def _on_all(x: Excitation, axis: int, course: Array) -> Array:

@@ -23,6 +23,8 @@ from magtensor.loop.searching.contribution import (
 from magtensor.loop.searching.gates import SECOND_ORDER
 from magtensor.loop.searching.overheard import shown_by_one
 
+MOST = 0.5  # of a model's sensors
+
 
 def on_those_needed(record: Record, state: State, which: int, how: Fitting) -> State:
     """Refit with one of the models on those of its sensors that need it."""
@@ -95,9 +97,34 @@ def on_those_that_show(record: Record, state: State, how: Fitting, fixed: int) -
 
 
 def _needed(state: State, which: int) -> tuple[str, ...] | None:
-    """The sensors on which alone a model does as well; None where it needs all that it has."""
+    """The sensors on which alone a model does as well; None where it needs all that it has.
+
+    What most of them show is an effect of all, of which the others have little: what they have of it would be in the
+    field that all see, were it taken for none. They keep coefficients, and are not named (`named`).
+    """
+    sensors = _shown_alone(state, which)
+    if sensors is None:
+        return _sufficient(state, which)
+    return None if len(sensors) > MOST * len(_owners(state, which)) else sensors
+
+
+def named(state: State, which: int) -> tuple[str, ...]:
+    """The sensors on which a model is said to act: those that show it, where it can do without the others."""
+    found = None if state.adopted[which].name == NAME else _shown_alone(state, which)
+    return found or _owners(state, which)
+
+
+def _shown_alone(state: State, which: int) -> tuple[str, ...] | None:
+    """Sensors whose own coefficients are significant, where all others can go together; None where all are needed."""
     sensors = sensors_showing(state, which)
-    return sensors if sensors is not None and _spare(state, which, sensors) else _sufficient(state, which)
+    return sensors if sensors is not None and _spare(state, which, sensors) else None
+
+
+def _owners(state: State, which: int) -> tuple[str, ...]:
+    """The sensors that have coefficients of a model, in their order."""
+    assert state.terms is not None
+    owners = set(state.terms.sensors[slices(state)[which]])
+    return tuple(s for s in state.excitation.sensors if s in owners)
 
 
 def _spare(state: State, which: int, sensors: tuple[str, ...], least: float = SEPARATION) -> bool:

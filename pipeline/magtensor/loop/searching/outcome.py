@@ -12,6 +12,7 @@ from magtensor.loop.fitting.model import CHANNEL, Adopted, Record
 from magtensor.loop.searching.contribution import happens_once
 from magtensor.loop.searching.found import Search, Step, without_and_with
 from magtensor.loop.searching.gates import Candidate
+from magtensor.loop.searching.on_fewer_sensors import named
 
 
 def described(found: Search, record: Record, declared: int) -> dict[str, Any]:
@@ -103,7 +104,7 @@ def _adopted(found: Search, index: int) -> dict[str, Any]:
     return {
         "error_model": model.name,
         "kind": model.component.effect,
-        "sensors": [s for s in state.excitation.sensors if s in set(sensors)],
+        "sensors": list(named(state, index)),
         "settings": _settings(model),
         "coefficients": [
             {"name": n, "sensor": s, "value": float(v), "std": float(d), "units": u}

@@ -39,7 +39,7 @@ from magtensor.loop.remainder.sparse_readings import SparseReadings, sparse_read
 from magtensor.loop.remainder.tones import of_the_turning
 from magtensor.loop.searching.found import Search
 from magtensor.loop.searching.latent import shared_words
-from magtensor.loop.searching.like_a_station import turns_with_the_platform
+from magtensor.loop.searching.like_a_station import channels_of_the_total_field, turns_with_the_platform
 from magtensor.loop.searching.suspects import Suspects
 from magtensor.sharing import shared_out
 
@@ -122,7 +122,8 @@ def _what_shows(found: Search, record: Record, excess: float, sparse: SparseRead
     predictable = following or converter_words(state)
     words.extend(predictable)
     words.extend(shortened_words(state))
-    words.extend([] if predictable else jitter_words(state))  # a field that turns sweeps through a law that it lacks
+    # a field that turns sweeps through a law that it lacks, and what trembles has a line and not another time
+    words.extend([] if predictable or line is not None else jitter_words(state))
     words.extend(changing)
     noise = float(np.hypot(OwnNoise(state.residual, None).slow_along(), of_the_station(state, record)))
     noise = float(np.hypot(noise, sparse.between if sparse is not None else 0.0))
@@ -134,6 +135,8 @@ def _what_shows(found: Search, record: Record, excess: float, sparse: SparseRead
             cause = ": it turns with the platform, as the field of something on it that no channel logs"
         elif alike:
             cause = ": an error of the base station, or a field that it does not see, of the site or of the platform"
+            if names := channels_of_the_total_field(state, ALPHA):
+                cause += f"; it follows {' and '.join(names)}"
         words.append(f"{slow:.3g} nT rms of |b| - F, {where}, is no white noise{cause}")
     return words
 
