@@ -187,6 +187,7 @@ def test_a_source_that_a_channel_is_like_names_it() -> None:
     assert [one["error_model"] for one in told] == ["latent_source"] and told[0]["most_like_channel"] == "valve"
 
 
+@pytest.mark.long
 def test_what_a_recipe_leaves_open_of_a_declared_model_stays_so() -> None:
     """A curve that is declared by its channel and bends alone, and an effect that is found beside it."""
     values, rain = course(6), course(4)

@@ -146,6 +146,7 @@ def test_what_dies_away_is_no_response_to_the_temperature_that_began_with_it(see
     assert adopted["settings"]["tau_s"] == pytest.approx(150.0, rel=0.1)
 
 
+@pytest.mark.long
 def test_a_start_of_another_form_is_no_response_to_a_board_that_warms_up(tmp_path: Path) -> None:
     """What dies away from a free beginning and the course of a board that warms up together bend like a bump."""
     path = survey_file(tmp_path, scenario(21), "bump.h5")

@@ -38,7 +38,8 @@ def test_a_boom_that_bends_under_load_is_named_with_its_channel(tmp_path: Path, 
     assert told["unexplained"]["present"] is False
 
 
-@pytest.mark.parametrize("seed", [82, pytest.param(83, marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("seed", [82, 83])
 def test_a_mount_that_creeps_does_not_bend_under_what_runs_out(tmp_path: Path, seed: int) -> None:
     told = told_of(tmp_path, {"type": "alignment_drift", "rms_nT": 1.0, "tau_s": 5000.0}, seed)
     assert "channel_alignment" not in adopted_names(told)

@@ -88,7 +88,8 @@ def with_a_compass(path: Path) -> None:
         file["heading"].attrs["units"] = "degree"
 
 
-@pytest.mark.parametrize("effect", ["site_gradient", pytest.param("temperature_scale", marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("effect", ["site_gradient", "temperature_scale"])
 def test_a_compass_does_not_stand_for_the_attitude(tmp_path: Path, effect: str) -> None:
     """Of what a gradient of the site does a heading predicts a part."""
     models = ["site_gradient", "channel_response", "moving_part", "temperature_scale"]

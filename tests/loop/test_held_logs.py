@@ -92,7 +92,8 @@ def test_a_temperature_offset_keeps_its_lag_and_needs_no_helper(held: bool, tmp_
     assert told["adopted"][0]["settings"]["lag_s"] == pytest.approx(50.0, abs=10.0)
 
 
-@pytest.mark.parametrize("every", [2, *(pytest.param(n, marks=pytest.mark.long) for n in (12, 60))])
+@pytest.mark.long
+@pytest.mark.parametrize("every", [2, 12, 60])
 def test_a_log_in_rows_of_its_own_is_searched(tmp_path: Path, every: int) -> None:
     """A thermometer that is read seldom, in a table that has a row for every sample: the others are empty."""
 

@@ -100,6 +100,7 @@ def test_an_undeclared_effect_is_found_and_nothing_else(
     assert evidence["z"] > 3
 
 
+@pytest.mark.long
 def test_a_delay_is_found_between_sensors_and_none_common_to_all(tmp_path: Path) -> None:
     """DESIGN 3: a common delay is a turn of the field, which nobody measured."""
     late = {"type": "sampling_lag", "lag_s": [[2e-3] * 3, [0.0] * 3, [0.0] * 3, [0.0] * 3]}
