@@ -120,10 +120,10 @@ def _compared(model: Adopted, theta: Array, before: State) -> _Compared | None:
     residual, given = thinned(before, REFINING_SAMPLES)
     held = [] if given is None else [given]
     own = _with_slopes(model, theta, x).at(residual.samples)
-    apart = _of_time(model, x, name)
-    courses = joined(apart).at(residual.samples)
-    alike = courses if name == THE_FIELD else _of_its_pattern(apart, theta, x).at(residual.samples)
-    station = joined([x.on_reference(course, "nT", "") for course in _courses(x).T]).at(residual.samples)
+    apart = [made.at(residual.samples) for made in _of_time(model, x, name)]
+    courses = joined(apart)
+    alike = courses if name == THE_FIELD else _of_its_pattern(apart, theta, x)
+    station = joined([x.on_reference(course, "nT", "") for course in _courses(x)[residual.samples].T])
     every = joined([*held, own, courses])
     left = taken_off(residual, every, estimated(residual, every, WHITE).theta)
     colours = colours_of(left, stiff=True, above=FIRST_LEFT)

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from magtensor.calibration.types import Array
 from magtensor.error_models.excitation import Excitation
@@ -98,7 +99,7 @@ def may_be_its_law(other: Adopted, terms: Terms, theta: Array, state: State) -> 
         return True
     outputs = len(state.residual.noise)
     added = terms.contribution(theta, outputs)
-    courses = _courses(other, x)[samples]
+    courses = _courses(other, x, samples)
     whole = left = 0.0
     for number, series in enumerate(added.T):
         own = np.ones(len(samples)) if theirs.adds_to_axes else x.output[samples].reshape(len(samples), -1)[:, number]
@@ -111,11 +112,11 @@ def may_be_its_law(other: Adopted, terms: Terms, theta: Array, state: State) -> 
     return left < (1.0 - MOST) * whole
 
 
-def _courses(model: Adopted, x: Excitation) -> Array:
-    """(N, K) smooth courses of time, and powers of the channels of a model."""
+def _courses(model: Adopted, x: Excitation, samples: NDArray[np.int_]) -> Array:
+    """(n, K) smooth courses of time, and powers of the channels of a model, at some samples."""
     names = sorted(model.channels(x) | {need for need in model.component.declared({}).needs if need in x.logged})
-    logged = (np.nan_to_num(x.channel(name)).reshape(len(x.time), -1).T for name in names)
-    series = [x.elapsed, *(channel for several in logged for channel in several)]
+    logged = (np.nan_to_num(x.channel(name)[samples]).reshape(len(samples), -1).T for name in names)
+    series = [x.elapsed[samples], *(channel for several in logged for channel in several)]
     spans = [(s - s.min()) / max(float(np.ptp(s)), 1e-300) * 2.0 - 1.0 for s in series]
     return np.hstack([np.polynomial.legendre.legvander(s, POWERS)[:, 1:] for s in spans])
 

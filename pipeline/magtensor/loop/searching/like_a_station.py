@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from magtensor.calibration.types import Array
 from magtensor.error_models.excitation import Excitation
@@ -16,7 +17,6 @@ from magtensor.loop.evidence.assessment import WHITE, Colours, assess, estimated
 from magtensor.loop.evidence.grams import Whitened
 from magtensor.loop.evidence.residual import Residual
 from magtensor.loop.fitting.model import Adopted, State
-from magtensor.loop.searching.beginnings import one_pattern
 from magtensor.loop.searching.contribution import put_back, slices
 
 APART_ALPHA = 1e-4  # what no station does has to be as unlikely by chance
@@ -44,7 +44,7 @@ def as_a_station_would(state: State, place: int) -> bool:
     if _beyond(replace(back, along=None), colours, mine, [others])[1] <= APART_ALPHA:
         return False
     along = replace(back, across=None)
-    alike = _of_a_station(state.excitation, state.adopted[place]).at(back.samples)
+    alike = _of_a_station(state.excitation, state.adopted[place], back.samples)
     turning, by_chance = _beyond(along, colours, mine, [others, alike])
     either = turning + _beyond(along, colours, alike, [others])[0]
     return by_chance > APART_ALPHA or turning < A_PART * either
@@ -57,10 +57,8 @@ def turns_with_the_platform(state: State) -> bool:
     count = min(MORE_COURSES, len(residual.samples) // EACH)
     if residual.along is None or not count:
         return False
-    slow = _half_waves(x, count)
-    fixed = joined([one_pattern(_on_all(x, axis, course), f"{axis}") for axis in range(3) for course in slow.T])
-    station = joined([x.on_reference(course, "nT", "") for course in slow.T])
-    fixed, station = fixed.at(residual.samples), station.at(residual.samples)
+    slow = _half_waves(x, count)[residual.samples]
+    fixed, station = _on_the_platform(x, slow), joined([x.on_reference(course, "nT", "") for course in slow.T])
     given = [] if state.terms is None else [state.terms]
     turning = _beyond(replace(residual, across=None), WHITE, fixed, [*given, station])[0]
     return turning > MOSTLY * (float(np.sum(residual.along**2)) - len(residual.along))
@@ -91,9 +89,14 @@ def channels_of_the_total_field(state: State, alpha: float) -> list[str]:
     return found
 
 
-def _on_all(x: Excitation, axis: int, course: Array) -> Array:
-    """(N, 3 S) outputs of a field along an axis of the platform with a course (N,)."""
-    return np.asarray(course[:, None] * x.matrix[:, :, axis].ravel())
+def _on_the_platform(x: Excitation, courses: Array) -> Terms:
+    """Fields along the three axes of the platform, each with each of the courses (N, K), as all sensors see them."""
+    outputs, count = 3 * len(x.sensors), courses.shape[1]
+    term, output = np.divmod(np.arange(3 * count * outputs), outputs)
+    axis, course = np.divmod(term, count)
+    names = tuple(f"{a}{k}" for a in "xyz" for k in range(count))
+    weight = x.matrix.reshape(outputs, 3)[output, axis]
+    return Terms(names, ("",) * len(names), ("nT",) * len(names), courses, term, output, course, part_weight=weight)
 
 
 def _half_waves(x: Excitation, count: int) -> Array:
@@ -101,12 +104,12 @@ def _half_waves(x: Excitation, count: int) -> Array:
     return np.asarray(np.cos(np.pi * np.outer(elapsed, np.arange(1, count + 1))))
 
 
-def _of_a_station(x: Excitation, model: Adopted) -> Terms:
-    """Courses of the total field that all sensors see alike: slow ones, and those of a model's channels as they are
-    logged and as it follows them, with their squares."""
+def _of_a_station(x: Excitation, model: Adopted, samples: NDArray[np.int_]) -> Terms:
+    """Courses of the total field that all sensors see alike, at some samples: slow ones, and those of a channel
+    of a model as it is logged and as the model follows it, with their squares."""
     lag = float(model.settings.get("lag_s", 0.0))
     followed = [_powers(x.channel(c, s)) for c in sorted(model.channels(x)) for s in dict.fromkeys((0.0, lag))]
-    courses = np.hstack([_half_waves(x, COURSES), *followed])
+    courses = np.hstack([_half_waves(x, COURSES), *followed])[samples]
     return joined([x.on_reference(course, "nT", "") for course in courses.T])
 
 
