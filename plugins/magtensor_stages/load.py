@@ -337,7 +337,7 @@ def _judge_position(survey: Survey, magnitude: str, where: str, notes: list[str]
     position = np.asarray(survey.values("position"), dtype=np.float64)
     if unplaced := [s for s, p in zip(survey.sensors, position, strict=True) if not np.isfinite(p).all()]:
         raise DataError(
-            f"{', '.join(unplaced)}: no finite number",
+            f"the position of sensor {', '.join(unplaced)} is not a finite number",
             where=f"{where}: position",
             hint="give the place of every sensor, or of none: then there is no tensor",
         )

@@ -140,7 +140,7 @@ def test_a_sensor_without_a_place_is_named(load_variables: Load, variables: Vari
     position = np.zeros((len(load_variables(variables).sensors), 3))
     position[:, 0] = np.arange(len(position)) * 0.5
     position[1, 2] = np.nan
-    with pytest.raises(DataError, match=r"position: S2: no finite number\n  .*or of none"):
+    with pytest.raises(DataError, match=r"position: the position of sensor S2 is not a finite number\n  .*or of none"):
         load_variables({**variables, "position": (["sensor", "axis"], position, {"units": "m"})})
 
 
