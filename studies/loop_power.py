@@ -11,6 +11,7 @@ degrees, or 136 static postures. It goes through the whole search, with every er
 - **told**: nothing was adopted, but the verdict says that something unexplained is left; **missed**: it does not.
 - **part**, where several effects were in the survey: some of them were adopted, and nothing else.
 
+Most effects are there twice: with coefficients of each sensor's own, and (**alike**) with the same ones in all sensors.
 Surveys with several effects have them from different families, so that none is another's rival, each of the rms given.
 
 The **oracle** tests the right effect alone, once, with the right settings, in noise whose colour it knows from the same
@@ -43,7 +44,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import loop_power_page
 import numpy as np
 import trials
-from loop_surveys import BASE, EFFECTS, FAMILIES, MOTIONS, recorded, scenario
+from loop_surveys import BASE, EVERY_EFFECT, FAMILIES, MOTIONS, model_of, recorded, scenario
 
 from magtensor.components import Component
 from magtensor.errors import MagtensorError
@@ -131,14 +132,15 @@ def oracle(trial: Trial, simulation: Simulated, record: Record, state: State) ->
     """The p value of the effect alone with its right settings; None where these cannot be known."""
     from scipy.stats import chi2
 
-    if trial.effect in ("", "latent_source") or "+" in trial.effect:
+    model = model_of(trial.effect)
+    if model in ("", "latent_source") or "+" in model:
         return None
-    settings = dict(RIGHT.get(trial.effect, {}))
-    if trial.effect in ("offset_drift", "reference_drift", "scale_drift"):
+    settings = dict(RIGHT.get(model, {}))
+    if model in ("offset_drift", "reference_drift", "scale_drift"):
         settings["span_s"] = float(np.ptp(record.time))
-    if trial.effect == "reference_clock":
+    if model == "reference_clock":
         settings["lag_s"] = delay_s(simulation)
-    terms = models()[trial.effect].function(state.excitation, **settings).at(state.residual.samples)
+    terms = models()[model].function(state.excitation, **settings).at(state.residual.samples)
     known = colours_without(trial._replace(effect="", amplitude=0.0))
     colours = known.among(state.residual)
     estimate = estimated(state.residual, terms, colours)
@@ -150,7 +152,7 @@ def tests(trial: Trial, state: State) -> float:
     every = testable(state.excitation, list(models().values()))
     few = Thinned.of(state, SCREENING_SAMPLES)
     delays = Delays(state.residual, state.excitation)
-    found = best_settings(models()[trial.effect], state, few, delays, {}, ALPHA / len(every))
+    found = best_settings(models()[model_of(trial.effect)], state, few, delays, {}, ALPHA / len(every))
     return len(every) * (found[0].tried if found else 1.0)
 
 
@@ -175,12 +177,12 @@ def lost(found: Search, effect: str) -> str:
 
 
 def judged(effect: str, found: Search, left: bool) -> str:
-    """The outcome in one word."""
+    """The outcome in one word, of effects joined by "+"."""
     adopted = {a.name for a in found.last.adopted}
     if not adopted:
         return "told" if left else "missed" if effect else "clean"
     named = [{s.adopted.model.name, *s.rivals} for s in found.steps if s.adopted and s.adopted.model.name in adopted]
-    wanted = set(effect.split("+")) - {""}
+    wanted = {model_of(one) for one in effect.split("+")} - {""}
     strange = not all(wanted & names for names in named)
     all_found = bool(wanted) and all(any(w in names for names in named) for w in wanted)
     if all_found:
@@ -209,7 +211,7 @@ def tried(trial: Trial) -> dict[str, Any]:
     row["rivals"] = sorted({r for s in found.steps for r in s.rivals})
     row["left"] = left["description"]
     if row["outcome"] != "right":
-        missed = [e for e in trial.effect.split("+") if e and e not in row["adopted"]]
+        missed = [e for e in map(model_of, trial.effect.split("+")) if e and e not in row["adopted"]]
         if missed:
             row["why"] = "; ".join(lost(found, e) for e in missed)
     return row
@@ -244,7 +246,7 @@ def main() -> None:
     parser.add_argument("--clean", type=int, default=10, help="clean surveys of each motion and noise")
     parser.add_argument("--seeds", type=int, default=1, help="surveys of each effect, amplitude, motion and noise")
     parser.add_argument("--several", type=int, default=10, help="tumbling surveys with two and with three effects, 1 x")
-    parser.add_argument("--effects", default=",".join(EFFECTS))
+    parser.add_argument("--effects", default=",".join(EVERY_EFFECT))
     parser.add_argument("--amplitudes", default="1,3,0.3", help="rms of the effect in units of the white noise")
     parser.add_argument("--motions", default=",".join(MOTIONS))
     parser.add_argument("--noises", default="white and 1/f", help=f"of the surveys with effects: {', '.join(NOISES)}")

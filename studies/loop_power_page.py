@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
+from loop_surveys import model_of
+
 Row = dict[str, Any]
 ORACLE_LEVEL = 0.005  # the loop's family-wise level, for the one test of the oracle
 FEW = 50  # surveys below which a table says itself that it is a small sample
@@ -48,7 +50,7 @@ def affordable(row: Row) -> bool:
 
 def by_rival(row: Row) -> bool:
     """Whether the effect was adopted under the name of a model that it is declared indistinguishable from."""
-    return row["outcome"] == "right" and row["effect"] not in row["adopted"]
+    return row["outcome"] == "right" and model_of(row["effect"]) not in row["adopted"]
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> Iterator[str]:

@@ -96,6 +96,20 @@ EFFECTS: dict[str, dict[str, Any]] = {
     "reference_step": {"time_s": [700.0]},
     "passing_source": {"time_s": 900.0, "closest_m": [12.0, 0.0, 0.0], "velocity_m_s": [0.0, 0.5, 0.0]},
 }
+ALIKE = " alike"  # behind an effect's name: with the same coefficients in all sensors
+OWN_TO_NO_SENSOR = {
+    "offset_while",
+    "averaging",
+    "moving_part",
+    "fixed_source",
+    "site_gradient",
+    "passing_source",
+    "reference_scale",
+    "reference_clock",
+    "reference_drift",
+    "reference_step",
+}  # that have no coefficients of each sensor, or draw none
+EVERY_EFFECT = [*EFFECTS, *(effect + ALIKE for effect in EFFECTS if effect not in OWN_TO_NO_SENSOR)]
 FAMILIES = (
     (
         "temperature_offset",
@@ -130,8 +144,8 @@ SENSORS = 4  # of the cross
 
 
 def scenario(motion: str, flicker: float, seed: int, effect: str = "", amplitude: float = 0.0) -> dict[str, Any]:
-    """A survey with 1/f noise (nT/rtHz at 1 Hz) and an effect of so many times the white noise; several joined by "+",
-    none for ""."""
+    """A survey with 1/f noise (nT/rtHz at 1 Hz) and an effect of so many times the white noise: one of `EVERY_EFFECT`,
+    several joined by "+", none for ""."""
     made = copy.deepcopy(BASE) | {"motion": MOTIONS[motion], "seed": seed, "truth": False}
     made["instrument"]["seed"] = 40 + seed
     made["instrument"]["noise"]["flicker_nT_per_rtHz"] = flicker
@@ -139,8 +153,17 @@ def scenario(motion: str, flicker: float, seed: int, effect: str = "", amplitude
     return made
 
 
+def model_of(effect: str) -> str:
+    """The error model's name of an effect, in its sensors alike or not."""
+    return effect.removesuffix(ALIKE)
+
+
 def _described(effect: str, rms: float, seed: int) -> list[dict[str, Any]]:
     """An effect of some rms (nT) for the simulator; an offset for a while is two jumps of opposite sign."""
+    if effect.endswith(ALIKE):
+        name = model_of(effect)
+        settings = {key: value for key, value in EFFECTS[name].items() if key != "sensors"}
+        return [{"type": name, "rms_nT": rms, "alike": True} | settings]
     if effect != "offset_while":
         return [{"type": effect, "rms_nT": rms} | EFFECTS[effect]]
     first, last = EFFECTS[effect]["time_s"]

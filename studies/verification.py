@@ -30,7 +30,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import trials
 from loop_power import NOISES, RIGHT
-from loop_surveys import EFFECTS, recorded, scenario
+from loop_surveys import EFFECTS, model_of, recorded, scenario
 
 import magtensor
 from magtensor.errors import MagtensorError
@@ -58,17 +58,18 @@ class Trial(NamedTuple):
 
 def written(trial: Trial, folder: Path) -> tuple[Path, Path]:
     """Both surveys as files."""
+    model = model_of(trial.effect)
     first = scenario(trial.motion, NOISES[NOISE], trial.seed, trial.effect, trial.amplitude)
-    first["effects"] = [effect | AT_REST.get(trial.effect, {}) for effect in first["effects"]]
+    first["effects"] = [effect | AT_REST.get(model, {}) for effect in first["effects"]]
     made = simulate(first)
     second = copy.deepcopy(scenario(trial.motion, NOISES[NOISE], trial.seed + 1))
     second["instrument"]["seed"] = first["instrument"]["seed"]
     second["effects"] = []
     for described, truth in zip(first["effects"], made.truth.effects, strict=True):
-        if truth.kind != "instrument" or trial.effect == "lag_step":
+        if truth.kind != "instrument" or model == "lag_step":
             continue
-        known = {key: value for key, value in described.items() if key != "rms_nT"}
-        if trial.effect == "channel_response":  # its square is about the mean of the survey that it was found in
+        known = {key: value for key, value in described.items() if key not in ("rms_nT", "alike")}
+        if model == "channel_response":  # its square is about the mean of the survey that it was found in
             known["reference"] = float(recorded(made).origins[known["channel"]])
         second["effects"].append(known | truth.coefficients)
     write(made, folder / "first.h5")
@@ -79,7 +80,8 @@ def written(trial: Trial, folder: Path) -> tuple[Path, Path]:
 def tried(trial: Trial) -> dict[str, Any]:
     """The row of one trial."""
     row: dict[str, Any] = trial._asdict()
-    told = dict(RIGHT.get(trial.effect, {}))
+    model = model_of(trial.effect)
+    told = dict(RIGHT.get(model, {}))
     with tempfile.TemporaryDirectory() as name:
         try:
             first, second = written(trial, Path(name))
@@ -89,8 +91,8 @@ def tried(trial: Trial) -> dict[str, Any]:
             for key, figure in FIGURES.items():
                 before, after = (found["error"]["verify"][when][figure]["all"] for when in ("before", "after"))
                 row[key] = {"linear": before, "loop": after}
-            if trial.effect != "latent_source":
-                best = magtensor.close_loop(first, verify=second, declared={trial.effect: told}, search=[]).verdict
+            if model != "latent_source":
+                best = magtensor.close_loop(first, verify=second, declared={model: told}, search=[]).verdict
                 for key, figure in FIGURES.items():
                     row[key]["told"] = best["error"]["verify"]["after"][figure]["all"]
         except MagtensorError as error:

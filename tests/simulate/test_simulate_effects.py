@@ -137,6 +137,38 @@ def test_only_the_sensors_named_are_affected() -> None:
     assert np.sqrt(np.mean(truth.added[:, [1, 3]] ** 2)) == pytest.approx(1.0, rel=1e-6)
 
 
+@pytest.mark.parametrize(
+    "name", ["temperature_offset", "sampling_lag", "viscous_magnetisation", "periodic_interference"]
+)
+def test_all_sensors_alike(name: str) -> None:
+    settings = EVERY[name] | {"rms_nT": 1.0}
+    field = {k: v for k, v in surroundings()["field"].items() if k != "dipoles"}  # else no two sensors see the same
+    bare = surroundings() | {"field": field, "instrument": PERFECT}
+
+    def alone(alike: bool) -> Any:
+        return simulate(bare | {"effects": [{"type": name, "alike": alike} | settings]}).truth.effects[0]
+
+    together, apart = alone(True), alone(False)
+    (same,) = together.coefficients.values()
+    assert all(one == same[0] for one in same)
+    np.testing.assert_allclose(together.added, together.added[:, :1].repeat(4, axis=1), atol=1e-9)
+    assert np.abs(np.diff(apart.added, axis=1)).max() > 0.5
+    assert together.rms_nT == pytest.approx(1.0, rel=1e-4)
+    assert together.settings == apart.settings
+
+
+@pytest.mark.parametrize(
+    ("effect", "told"),
+    [
+        ({"type": "temperature_offset", "nT_per_degC": [1.0, 2.0, 3.0], "alike": True}, "alike is for coefficients"),
+        ({"type": "crosstalk", "rms_nT": 1.0, "alike": True}, "crosstalk has no coefficients of each sensor"),
+    ],
+)
+def test_alike_where_it_says_nothing_is_refused(effect: dict[str, Any], told: str) -> None:
+    with pytest.raises(UsageError, match=told):
+        simulate(surroundings() | {"effects": [effect]})
+
+
 def added(name: str, settings: dict[str, Any], **sections: Any) -> tuple[NDArray[np.float64], Simulated]:
     """What one effect adds, (N, S, 3), on perfect sensors unless said otherwise."""
     survey = simulate(scenario(**({"instrument": PERFECT} | sections), effects=[{"type": name} | settings]))

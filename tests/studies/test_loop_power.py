@@ -17,3 +17,11 @@ def test_a_sensor_whose_length_a_late_base_station_spoils_has_its_share_of_a_tem
     effects = "reference_clock+temperature_scale"
     row = loop_power.tried(loop_power.Trial(effects, 3.0, "tilt 40", "white and 1/f", 5023, 2.0))
     assert row["outcome"] == "right" and sorted(row["adopted"]) == sorted(effects.split("+"))
+
+
+def test_an_effect_of_all_sensors_alike_is_judged_by_its_model() -> None:
+    row = loop_power.tried(
+        loop_power.Trial("nonlinearity_quadratic alike", 3.0, "postures", "white and 1/f", 2000, 2.0)
+    )
+    assert row["outcome"] == "right" and row["adopted"] == ["nonlinearity_quadratic"]
+    assert row["oracle"] < 1e-6

@@ -195,6 +195,15 @@ class SensorEffectSpec(EffectSpec):
     """An effect on the raw output of the sensors."""
 
     sensors: list[str] | None = Field(None, min_length=1, description="names of the sensors it acts on; all where null")
+    alike: bool = Field(
+        False, description="where drawn: true: the same coefficients for all sensors; false: each sensor has its own"
+    )
+
+    @model_validator(mode="after")
+    def _alike_if_drawn(self) -> SensorEffectSpec:
+        if self.alike and self.given is not None:
+            raise ValueError(f"alike is for coefficients that are drawn; {self.COEFFICIENTS} says what each sensor has")
+        return self
 
     def drawn(self, bench: Bench, rng: np.random.Generator) -> Array:
         """Coefficients of random size and sign; (S, 3) unless overridden."""
@@ -253,6 +262,10 @@ def sensor_effect(spec: SensorEffectSpec, number: int, instrument_seed: int, ben
 
     rng = stream(instrument_seed, "effect", spec.name, str(number))
     values = spec.drawn(bench, rng) if spec.given is None else spec.read(bench)
+    if spec.alike:
+        if values.shape[:1] != (bench.sensors,):
+            raise UsageError(f"effect {spec.name} has no coefficients of each sensor, so alike says nothing of it")
+        values = np.broadcast_to(values[:1], values.shape)
     added, rms = run(values)
     if spec.rms_nT is not None:
         for _ in range(1 if spec.LINEAR else 8):
@@ -274,5 +287,5 @@ def rms_of(added: Array, kept: np.ndarray, sensors: int) -> float:
 
 def truth_of(spec: EffectSpec, rms: float, sensors: list[str], values: Array) -> EffectTruth:
     """The record of an effect with the coefficients it ended up with."""
-    settings = spec.model_dump(exclude={"type", "rms_nT", "sensors", spec.COEFFICIENTS})
+    settings = spec.model_dump(exclude={"type", "rms_nT", "sensors", "alike", spec.COEFFICIENTS})
     return EffectTruth(spec.name, spec.KIND, rms, sensors, settings, {spec.COEFFICIENTS: np.asarray(values).tolist()})

@@ -148,6 +148,8 @@ class PeriodicInterference(SensorEffectSpec):
         added = np.zeros((len(bench.time), bench.sensors, 3))
         for order, ratio in enumerate([1.0, *self.harmonics], start=1):
             phase = rng.uniform(0, 2 * np.pi, (bench.sensors, 3))
+            if self.alike:
+                phase[:] = phase[0]
             turn = 2 * np.pi * order * self.frequency_Hz * bench.time
             added += np.cos(turn)[:, None, None] * (ratio * coefficients * np.cos(phase))
             added += np.sin(turn)[:, None, None] * (ratio * coefficients * np.sin(phase))
