@@ -15,6 +15,8 @@ KNOTS = 17  # of a curve: an eighth of the field apart, which offsets of an arra
 OF_A_TONE = 3.0  # times what a tone of the outputs makes of a line itself, that the platform's turning makes more
 DEGREE = 3  # of the field's direction, the largest
 WIDTH = 4  # frequencies, a survey's length apart, beyond which the window shows nothing of a line
+CELLS = 4096  # that a series is summed in, turned by the line's own frequency: those beside turn by 0.02 rad in half one
+CELLS_AT_ONCE = 128
 BESIDE = np.array([s * k for k in range(WIDTH, 31, 3) for s in (-1, 1)])  # such frequencies, the nearest first
 
 
@@ -97,13 +99,24 @@ def largest_lines(series: Array, x: Excitation, frequencies_Hz: Sequence[float],
     them has, or none of more than (F, K) `least`."""
     window = np.blackman(len(series) + 2)[1:-1]
     window /= window.sum()
-    series = (series - window @ series) * window[:, None]
+    mean = window @ series
+    since = x.time - x.time[0]
     step = 1.0 / max(x.duration, 1e-300)
+    starts = np.flatnonzero(np.diff(np.floor(since * step * CELLS), prepend=-1.0))  # of stretches of equal length
+    within = np.add.reduceat(since, starts) / np.diff(starts, append=len(since))
+    sums = np.zeros((len(frequencies_Hz), len(starts), series.shape[1]), dtype=complex)
+    for first in range(0, len(starts), CELLS_AT_ONCE):
+        cells = starts[first : first + CELLS_AT_ONCE]
+        rest = starts[first + CELLS_AT_ONCE : first + CELLS_AT_ONCE + 1]
+        piece = slice(cells[0], rest[0] if len(rest) else len(since))
+        weighed = (series[piece] - mean) * window[piece, None]
+        for sum_, frequency in zip(sums, frequencies_Hz, strict=True):
+            turned = np.exp(-2j * np.pi * frequency * since[piece])[:, None]
+            sum_[first : first + len(cells)] = np.add.reduceat(weighed * turned, cells - cells[0])
+    asked = np.exp(-2j * np.pi * step * np.outer(np.concatenate([[0.0], BESIDE]), within))
     out = np.zeros(len(frequencies_Hz))
-    for i, frequency in enumerate(frequencies_Hz):
-        asked = frequency + step * np.concatenate([[0.0], BESIDE])
-        turned = np.exp(-2j * np.pi * np.outer(asked, x.time - x.time[0]))
-        here, *beside = 2.0 * np.abs(turned @ series)
+    for i, sum_ in enumerate(sums):
+        here, *beside = 2.0 * np.abs(asked @ sum_)
         next_to_it = np.max(beside[:2], axis=0)  # larger on the skirts of another line
         line = (here**2 > LINE * np.median(beside, axis=0) ** 2) & (here > next_to_it)
         if least is not None:
