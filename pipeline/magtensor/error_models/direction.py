@@ -15,7 +15,9 @@ KNOTS = 17  # of a curve: an eighth of the field apart, which offsets of an arra
 OF_A_TONE = 3.0  # times what a tone of the outputs makes of a line itself, that the platform's turning makes more
 DEGREE = 3  # of the field's direction, the largest
 WIDTH = 4  # frequencies, a survey's length apart, beyond which the window shows nothing of a line
-CELLS = 4096  # that a series is summed in, turned by the line's own frequency: those beside turn by 0.02 rad in half one
+CELLS = (
+    4096  # that a series is summed in, turned by the line's own frequency: those beside turn by 0.02 rad in half one
+)
 CELLS_AT_ONCE = 128
 BESIDE = np.array([s * k for k in range(WIDTH, 31, 3) for s in (-1, 1)])  # such frequencies, the nearest first
 

@@ -36,7 +36,10 @@ from magtensor.loop.searching.rivals import hardly_begun
 NOT_AS_ASSUMED = "fitted, its coefficients are not what its settings assume"
 ONE_OF_A_KIND = "fitted, it comes out the same as one that is adopted already"  # its law is no single one
 MOST_OF_DIFFERENCES = 0.1  # positions wrong by a tenth of the array, where its law ends to be of first order
-LIKE_HEAT = "what the sun, or an engine, warms on one side would look the same"
+MAYBE_HEAT = (
+    "fitted, it goes with one direction of the lagged field: what the sun, or an engine, warms on one side would look "
+    "the same"
+)
 UNEARNED = "fitted, it does not earn its place on held-out blocks"
 
 
@@ -121,7 +124,7 @@ def why_not(record: Record, before: Trial, after: Trial, chosen: Candidate, how:
     if shorter := _shorter_than_shown(model, x):
         return f"fitted, its {shorter} is shorter than the samples can show: something quicker would do as well"
     if model.name == VISCOUS and of_one_direction(after.state, which):
-        return f"fitted, it goes with one direction of the lagged field: {LIKE_HEAT}"
+        return MAYBE_HEAT
     if not agrees(after.state, which):
         return NOT_AS_ASSUMED
     if (share := share_of_differences(after.state, which)) > MOST_OF_DIFFERENCES:

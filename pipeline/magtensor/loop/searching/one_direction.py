@@ -35,11 +35,11 @@ def of_one_direction(state: State, which: int) -> bool:
     terms = state.terms.only([*every, *range(own.start, own.stop)])
     found = estimated(put_back(state.residual, state.terms, np.concatenate(state.theta)), terms, state.colours)
     theta, information = found.theta[len(every) :], found.beside(len(every))
-    sensors = len(theta) // 9
-    lost = beside_one_direction(theta.reshape(sensors, 3, 3), information)
-    freedom = 9 * sensors - (3 * sensors + 2)
+    matrices = theta.reshape(-1, 3, 3)
+    lost = beside_one_direction(matrices, information)
+    freedom = 9 * len(matrices) - (3 * len(matrices) + 2)
     least = float(chdtri(freedom, CHANCE))
-    return lost < max(least, HALF * left_by_chance(sensors) * float(theta @ information @ theta))
+    return lost < max(least, HALF * left_by_chance(matrices) * float(theta @ information @ theta))
 
 
 def beside_one_direction(matrices: Array, information: Array) -> float:
@@ -69,7 +69,11 @@ def _least(columns: NDArray[np.floating[Any]], theta: Array, information: Array)
     return np.asarray(np.linalg.lstsq(seen @ columns, seen @ theta, rcond=1e-9)[0])
 
 
-def left_by_chance(sensors: int) -> float:
-    """The share of its squares that a (3 S, 3) matrix of random entries has beside its largest singular value."""
-    values = np.linalg.svd(np.random.default_rng(1).standard_normal((200, 3 * sensors, 3)), compute_uv=False) ** 2
+def left_by_chance(matrices: Array) -> float:
+    """The share of its squares that a (3 S, 3) matrix of random entries has beside its largest singular value, the
+    sensors' matrices (S, 3, 3) as much alike as these: of one that all sensors have, one direction explains more."""
+    flat = matrices.reshape(len(matrices), -1)
+    sizes = np.sqrt(np.maximum(np.linalg.eigvalsh(flat @ flat.T), 0.0))
+    drawn = np.random.default_rng(1).standard_normal((200, len(sizes), 3, 3)) * sizes[:, None, None]
+    values = np.linalg.svd(drawn.reshape(200, -1, 3), compute_uv=False) ** 2
     return float(np.mean(1.0 - values[:, 0] / values.sum(axis=1)))

@@ -131,6 +131,12 @@ def overlaps(candidate: Candidate, other: Candidate, state: State) -> bool:
     return both - whole < SMALL_PART * own
 
 
+def stands_for_less(candidate: Candidate, other: Candidate, state: State) -> bool:
+    """Whether most of what a candidate predicts another one does, which predicts more: it is not what acts."""
+    whole, own, both = _beside(candidate, other, state)
+    return own < whole - SEPARATION and both - whole < SMALL_PART * own
+
+
 def part_of_a_drift(candidate: Candidate, candidates: Sequence[Candidate], state: State) -> Candidate | None:
     """A model of what lasts that predicts as much as a candidate of what happened once, and leaves it next to nothing;
     None where there is none.

@@ -21,6 +21,7 @@ from magtensor.loop.searching.exchange import exchanged, looked_at_again
 from magtensor.loop.searching.found import Step
 from magtensor.loop.searching.gates import Candidate
 from magtensor.loop.searching.keeping import (
+    MAYBE_HEAT,
     NOT_AS_ASSUMED,
     ONE_OF_A_KIND,
     UNEARNED,
@@ -45,6 +46,7 @@ from magtensor.loop.searching.rivals import (
     part_of,
     part_of_a_drift,
     simplest,
+    stands_for_less,
 )
 from magtensor.loop.searching.screening import candidates_of
 from magtensor.loop.searching.split import split
@@ -259,6 +261,8 @@ class Rounds:
                         refuse(c.model.name, f"a small part of what {chosen.model.name} explains, which failed")
                     elif tried.why == ONE_OF_A_KIND and overlaps(c, chosen, before.state):
                         refuse(c.model.name, f"most of it is what the law of {chosen.model.name} leaves")
+                    elif tried.why == MAYBE_HEAT and stands_for_less(c, chosen, before.state):
+                        refuse(c.model.name, f"{chosen.model.name} explains the same and more, and failed")
                 continue
             return Kept(tried.after, chosen, rivals, channels, dropped, refused)
         return Kept(None, refused=refused)
