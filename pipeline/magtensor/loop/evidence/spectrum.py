@@ -2,70 +2,152 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
 from magtensor.calibration.types import Array
-from magtensor.loop.evidence.colour import beside_the_field
+from magtensor.loop.evidence.colour import Colour, beside_the_field, colour_of
 from magtensor.loop.evidence.residual import Residual
 
 MOST_MISSING = 0.25  # of the samples of an even grid
 _ON_THE_GRID = 0.1  # of a step, that an interval may be off it
 _SPREAD = 10  # places of the fine grid to either side that a sample is spread over: to 1e-9
 _OF_A_MEDIAN = 2.0 / np.pi  # of what a mean of as many values tells
+_LEAST_SAMPLES = 256
+_BESIDE = 3.0  # frequencies, a survey's length apart, that are one line
+_LEAST_TURNED = 1e-2  # of the largest mean square of the direction's components, from which on one is known
 _LEAST_VARIANCE = 1e-6  # of the largest, of the noise of a coordinate
 
 
-def spectral_lines(residual: Residual, time: Array, most: int = 5) -> list[tuple[float, float, float]]:
-    """(frequency Hz, rms nT, p) of the strongest peaks of the residual across over its smooth spectrum.
+@dataclass(frozen=True)
+class _Grid:
+    """When the samples were taken.
 
-    p is that of the largest of all peaks under noise without lines. What C took of slow noise turns with the platform,
-    at a rate that would seem a line, and is put back (`colour.beside_the_field`). The lowest frequencies, where no
-    smooth spectrum can be told from a line, are left out; so are surveys that lack more than a quarter of their
-    samples. Those that are missing from an even grid are interpolated; where the times lie on none, each sample counts
-    at its own.
+    Attributes:
+        places: (N,) steps since the first; step: s; n: places of the grid; even: whether the samples lie on it.
     """
-    from scipy.special import chdtri, fdtrc
 
-    if len(time) < 256 or residual.across is None:
+    places: Array
+    step: float
+    n: int
+    even: bool
+
+    @classmethod
+    def of(cls, time: Array) -> _Grid:
+        """Of times (N,) in s."""
+        step = float(np.median(np.diff(time)))
+        steps = np.rint(np.diff(time) / step)
+        off = np.abs(np.diff(time) - steps * step).max()
+        even = bool(steps.min() >= 1.0 and off <= _ON_THE_GRID * step)
+        places = np.concatenate([[0.0], np.cumsum(steps)]) if even else (time - time[0]) / step
+        return cls(places, step, int(np.rint(places[-1])) + 1, even)
+
+    @property
+    def frequency(self) -> Array:
+        """(M,) Hz, above zero and below the highest of an even number of samples, which has one phase and not two."""
+        return np.arange(1, (self.n + 1) // 2) / (self.n * self.step)
+
+    def spectrum(self, coordinates: Array) -> NDArray[np.complex128]:
+        """(M, K) of coordinates (N, K)."""
+        places, n = self.places, self.n
+        found = (
+            _of_a_grid(coordinates, places, n) if self.even else transform(coordinates, places, n) * (n / len(places))
+        )
+        return found[1 : (n + 1) // 2]
+
+    def left_by(self, colour: Colour) -> Array:
+        """(M,) of an amplitude, what a filter that makes noise of a colour as white as its white part leaves."""
+        power = colour.power
+        if power is None:
+            return np.ones(len(self.frequency))
+        own = np.arange(len(power)) / (2.0 * len(power))
+        return np.asarray(1.0 / np.sqrt(np.interp(self.frequency * self.step, own, power)))
+
+
+@dataclass(frozen=True)
+class _Line:
+    frequency_Hz: float
+    rms_nT: float
+    p: float  # not cut off at one, for the order
+
+
+def spectral_lines(residual: Residual, time: Array, most: int = 5) -> list[tuple[float, float, float]]:
+    """(frequency Hz, rms nT, p) of the strongest peaks over the smooth spectrum of what differs between the sensors,
+    and of what is left of |b| - F as a field fixed to the platform makes it.
+
+    p is that of the largest of all peaks under noise without lines. The lowest frequencies, where no smooth spectrum
+    can be told from a line, are left out; so are surveys that lack more than a quarter of their samples. Those that are
+    missing from an even grid are interpolated; where the times lie on none, each sample counts at its own.
+    """
+    if len(time) < _LEAST_SAMPLES:
         return []
-    step = np.median(np.diff(time))
-    steps = np.rint(np.diff(time) / step)
-    off = np.abs(np.diff(time) - steps * step).max()
-    even = bool(steps.min() >= 1.0 and off <= _ON_THE_GRID * step)
-    places = np.concatenate([[0.0], np.cumsum(steps)]) if even else (time - time[0]) / step
-    n = int(np.rint(places[-1])) + 1
-    if len(time) < (1.0 - MOST_MISSING) * n:
+    grid = _Grid.of(time)
+    if len(time) < (1.0 - MOST_MISSING) * grid.n:
+        return []
+    lines: list[_Line] = []
+    for line in sorted([*_between(residual, grid, most), *_on_the_platform(residual, grid, most)], key=lambda o: o.p):
+        if all(abs(line.frequency_Hz - other.frequency_Hz) >= _BESIDE / (grid.n * grid.step) for other in lines):
+            lines.append(line)
+    return [(line.frequency_Hz, line.rms_nT, min(1.0, line.p)) for line in lines[:most]]
+
+
+def _between(residual: Residual, grid: _Grid, most: int) -> list[_Line]:
+    """Of what differs between the sensors. What C took of slow noise turns with the platform, at a rate that would seem
+    a line, and is put back (`colour.beside_the_field`)."""
+    if residual.across is None:
         return []
     values, vectors = np.linalg.eigh(residual.projector)
     coordinates, colour = beside_the_field(residual.across @ vectors[:, values > 0.5], residual.affine)
-    size = np.ones((n + 1) // 2 - 1)  # of the noise's amplitude that is left
-    if not even and colour.power is not None:
-        # what is slow would show at all frequencies, as the times scatter, in all coordinates alike
-        coordinates = colour.whiten(coordinates) * np.sqrt(colour.white)
-        size /= np.sqrt(np.interp(np.arange(1.0, len(size) + 1) / n, _cycles(colour.power), colour.power))
+    size: Array | float = 1.0
+    if not grid.even:  # what is slow would show at all frequencies, as the times scatter, in all coordinates alike
+        coordinates, size = colour.whiten(coordinates) * np.sqrt(colour.white), grid.left_by(colour)
+    spectrum = grid.spectrum(coordinates)
+    square = 2.0 * np.sum(np.abs(spectrum) ** 2, axis=1) / coordinates.shape[1]
+    return _largest(spectrum, coordinates, np.sqrt(square) / grid.n * residual.scale / size, grid, most)
+
+
+def _on_the_platform(residual: Residual, grid: _Grid, most: int) -> list[_Line]:
+    """Of a vector on the platform, alike at all sensors: |b| - F holds its part along the field, whose direction turns.
+    The rms is that of |b| - F."""
+    if residual.along is None:
+        return []
+    field = residual.affine[:, :3]
+    direction = field / np.linalg.norm(field, axis=1, keepdims=True)
+    colour = colour_of(residual.along)
+    # what is slow, a drift of the base station, would turn with the direction
+    left = colour.whiten(residual.along) * np.sqrt(colour.white) / residual.reference_gain
+    spectrum = grid.spectrum(left[:, None] * direction)
+    shown = np.linalg.pinv(direction.T @ direction / len(direction), rcond=_LEAST_TURNED, hermitian=True)
+    square = 2.0 * np.einsum("mi,ij,mj->m", spectrum.conj(), shown, spectrum).real
+    rms = np.sqrt(np.maximum(square, 0.0)) / grid.n / grid.left_by(colour)
+    return _largest(spectrum, left[:, None] * direction, rms, grid, most)
+
+
+def _largest(
+    spectrum: NDArray[np.complex128], coordinates: Array, rms_nT: Array, grid: _Grid, most: int
+) -> list[_Line]:
+    """The strongest peaks of a spectrum (M, K) of coordinates (N, K) over its running median."""
+    from scipy.special import chdtri, fdtrc
+
     k = coordinates.shape[1]
-    # without the highest frequency of an even number of samples, which has one phase and not two
-    spectrum = _of_a_grid(coordinates, places, n) if even else transform(coordinates, places, n) * (n / len(places))
-    spectrum = spectrum[1 : (n + 1) // 2]
-    power = np.sum(np.abs(spectrum @ _alike(coordinates)) ** 2, axis=1) / n
-    frequency = np.arange(1, len(power) + 1) / (n * step)
+    power = np.sum(np.abs(spectrum @ _alike(coordinates)) ** 2, axis=1) / grid.n
     width = max(len(power) // 100, 15)
     smooth = _running_median(power, width)
     ratio = power / np.maximum(smooth, 1e-300) * chdtri(2 * k, 0.5) / 2.0  # to the scale of k exponentials' sum
     ratio[: 2 * width] = 0.0
     known_from = 2 * k * _OF_A_MEDIAN * (2 * width + 1)
-    order = np.argsort(-ratio)
-    peaks: list[tuple[float, float, float]] = []
-    for i in order:
-        if len(peaks) == most:
+    frequency = grid.frequency
+    lines: list[_Line] = []
+    for i in np.argsort(-ratio):
+        if len(lines) == most:
             break
-        if any(abs(frequency[i] - f) < 3.0 / (n * step) for f, _, _ in peaks):
+        if any(abs(frequency[i] - other.frequency_Hz) < _BESIDE / (grid.n * grid.step) for other in lines):
             continue
-        p = min(1.0, float(fdtrc(2 * k, known_from, ratio[i] / k)) * len(power))
-        amplitude = float(np.sqrt(2.0 * np.sum(np.abs(spectrum[i]) ** 2) / k) / n * residual.scale / size[i])
-        peaks.append((float(frequency[i]), amplitude, p))
-    return peaks
+        p = float(fdtrc(2 * k, known_from, ratio[i] / k)) * len(power)
+        lines.append(_Line(float(frequency[i]), float(rms_nT[i]), p))
+    return lines
 
 
 def _of_a_grid(coordinates: Array, places: Array, n: int) -> NDArray[np.complex128]:
@@ -99,11 +181,6 @@ def transform(coordinates: Array, places: Array, n: int) -> NDArray[np.complex12
     m = np.arange(n // 2 + 1)
     undone = np.exp(width * (np.pi * m / fine) ** 2) / np.sqrt(np.pi * width)
     return np.asarray(rfft(spread, axis=0))[: len(m)] * undone[:, None]
-
-
-def _cycles(power: Array) -> Array:
-    """Cycles a sample of the frequencies of a colour."""
-    return np.arange(len(power)) / (2.0 * len(power))
 
 
 def _alike(coordinates: Array) -> Array:

@@ -17,6 +17,7 @@ from magtensor.loop.searching.adopting import adopt, on_all_sensors, polished
 from magtensor.loop.searching.after_a_pause import left_by_a_pause
 from magtensor.loop.searching.beginnings import at_its_limit, began_with_a_vector
 from magtensor.loop.searching.contribution import (
+    a_tone,
     agrees,
     happens_once,
     moments,
@@ -113,8 +114,8 @@ def why_not(record: Record, before: Trial, after: Trial, chosen: Candidate, how:
     if not two_channels and already(same, model.component, model.settings):
         return ONE_OF_A_KIND
     slow, channels = hardly_begun(chosen.model, x), sorted(model.channels(x))
-    if (slow or channels) and as_a_station_would(after.state, which):
-        drift = "drifts" if slow else f"follows {' and '.join(channels)}"
+    if (slow or channels or a_tone(model)) and as_a_station_would(after.state, which):
+        drift = "drifts" if slow else f"follows {' and '.join(channels)}" if channels else "has its period"
         return f"fitted, all sensors show it alike: an error of the base station that {drift} would look the same"
     if hardly_begun(model, x) and ((not slow and chosen.moved is None) or began_with_a_vector(model)):
         # of two of a kind one may be slow, and so may what was so at first sight, unless it is all that dies away

@@ -17,7 +17,7 @@ from magtensor.loop.evidence.assessment import WHITE, Colours, assess, estimated
 from magtensor.loop.evidence.grams import Whitened
 from magtensor.loop.evidence.residual import Residual
 from magtensor.loop.fitting.model import Adopted, State
-from magtensor.loop.searching.contribution import put_back, slices
+from magtensor.loop.searching.contribution import a_tone, put_back, slices, tones_of
 
 APART_ALPHA = 1e-4  # what no station does has to be as unlikely by chance
 A_PART = 0.1  # of what a model explains of |b| - F has to be none of a station's
@@ -34,14 +34,15 @@ def as_a_station_would(state: State, place: int) -> bool:
     It would where the model explains nothing of what differs between the sensors, and next to nothing of |b| - F beside
     courses that all sensors see alike. What a vector in their axes makes turns with the platform: no station does that.
     """
-    if state.residual.across is None or state.residual.along is None:
+    single = state.residual.across is None
+    if state.residual.along is None or (single and not a_tone(state.adopted[place])):
         return False
     assert state.terms is not None
     own = slices(state)[place]
     mine, numbers = state.terms.only(range(own.start, own.stop)), range(state.terms.count)
     others = state.terms.only(i for i in numbers if not own.start <= i < own.stop)
     back, colours = put_back(state.residual, mine, state.theta[place]), state.colours
-    if _beyond(replace(back, along=None), colours, mine, [others])[1] <= APART_ALPHA:
+    if not single and _beyond(replace(back, along=None), colours, mine, [others])[1] <= APART_ALPHA:
         return False
     along = replace(back, across=None)
     alike = _of_a_station(state.excitation, state.adopted[place], back.samples)
@@ -105,11 +106,12 @@ def _half_waves(x: Excitation, count: int) -> Array:
 
 
 def _of_a_station(x: Excitation, model: Adopted, samples: NDArray[np.int_]) -> Terms:
-    """Courses of the total field that all sensors see alike, at some samples: slow ones, and those of a channel
-    of a model as it is logged and as the model follows it, with their squares."""
+    """Courses of the total field that all sensors see alike, at some samples: slow ones, the tone of a model, and those
+    of a channel of it as it is logged and as the model follows it, with their squares."""
     lag = float(model.settings.get("lag_s", 0.0))
     followed = [_powers(x.channel(c, s)) for c in sorted(model.channels(x)) for s in dict.fromkeys((0.0, lag))]
-    courses = np.hstack([_half_waves(x, COURSES), *followed])[samples]
+    turns = 2.0 * np.pi * np.outer(x.elapsed, tones_of(model))
+    courses = np.hstack([_half_waves(x, COURSES), np.cos(turns), np.sin(turns), *followed])[samples]
     return joined([x.on_reference(course, "nT", "") for course in courses.T])
 
 
