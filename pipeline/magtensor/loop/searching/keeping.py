@@ -26,7 +26,7 @@ from magtensor.loop.searching.contribution import (
 )
 from magtensor.loop.searching.course_of_time import outweighed
 from magtensor.loop.searching.gates import Candidate
-from magtensor.loop.searching.left_out import better_left_out
+from magtensor.loop.searching.left_out import better_left_out, between_its_flanks
 from magtensor.loop.searching.like_a_station import as_a_station_would
 from magtensor.loop.searching.likeness import event_along
 from magtensor.loop.searching.on_fewer_sensors import narrowed
@@ -140,6 +140,8 @@ def why_not(record: Record, before: Trial, after: Trial, chosen: Candidate, how:
     theta = chosen.assessment.theta[-chosen.terms.count :]
     seen = chosen.before or before.state  # at the samples of its terms
     if happens_once(model):
+        if between_its_flanks(after.state, which):
+            return "samples between its times fit no calibration: it is what is seen beside them"
         if name := left_by_a_pause(after.state, which):
             return f"it follows a pause of the record, in which nobody knows what {name} came to"
         # fitted without it the other may have had a part of it, and so its vectors

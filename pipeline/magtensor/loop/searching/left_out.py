@@ -14,10 +14,23 @@ from magtensor.errors import DataError
 from magtensor.loop.fitting.model import Fitting, Record, State
 from magtensor.loop.fitting.refit import joint_state
 from magtensor.loop.fitting.trial import WORST_RISE
+from magtensor.loop.searching.contribution import moments
 
 MOST = 0.3  # of the samples, in an event that can be left out
 SEEN = 0.5  # of the noise of a sensor, from which on an effect acts
+LEFT_BETWEEN = 0.25  # of the samples of an event: what is seen beside a passage lasts up to three times as long as it
 LOUD = 2.0  # times what is left elsewhere
+
+
+def between_its_flanks(state: State, which: int) -> bool:
+    """Whether of the samples between the two times of an event more than a quarter have no part in the calibration:
+    what has no law that is known lies between them, a passing source say, and the event is what is seen beside it."""
+    when = moments(state.adopted[which])
+    if len(when) != 2:
+        return False
+    elapsed = state.excitation.elapsed
+    during = (elapsed >= when[0]) & (elapsed < when[1])
+    return bool(during.any() and np.mean(~np.asarray(state.fit.keep)[during]) > LEFT_BETWEEN)
 
 
 def better_left_out(record: Record, before: State, after: State, which: int, how: Fitting) -> bool:
