@@ -233,7 +233,7 @@ def test_duplicate_in_two_packages_names_both_distributions(monkeypatch, tmp_pat
         assert problem == "stage twin is given twice: by twin-a 2.1 (stages) and by twin-b 2.1 (stages)"
 
 
-def test_broken_package_stops_a_run_only_if_named(monkeypatch, tmp_path, capsys):
+def test_broken_package_stops_a_run_only_if_named(monkeypatch, tmp_path, capsys, caplog):
     def fails():
         raise ImportError("needs libfoo.so.3")
 
@@ -245,10 +245,14 @@ def test_broken_package_stops_a_run_only_if_named(monkeypatch, tmp_path, capsys)
     recipe = tmp_path / "recipe.yaml"
     recipe.write_text("title: t\nstages: [fine]\n")
     assert status_of(["validate", str(recipe)]) == 0
+    # a search that lacks a part of the catalogue has to be known as such
+    assert "the plugin radar-plugin 0.3 (radar) could not be loaded: ImportError: needs libfoo.so.3" in caplog.text
+    caplog.clear()
     for name in ("radar", "radar-plugin"):
         recipe.write_text(f"title: t\nplugins: [{name}]\nstages: [fine]\n")
         assert status_of(["validate", str(recipe)]) == 2
         assert f"the plugin {name} could not be loaded: ImportError: needs libfoo.so.3" in capsys.readouterr().err
+        assert not caplog.text
 
 
 HOSTILE = (

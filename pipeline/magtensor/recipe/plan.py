@@ -224,9 +224,11 @@ class _Planner:
         required += [((), Path(file)) for file in self.plugin_folders if Path(file).is_file()]
         for at, wanted in required:
             self.require(at, wanted)
-        for plugin in self.registry.broken():  # one of a folder's files: it may have nothing to do with this recipe
-            if plugin.file is not None and plugin.file not in {wanted for _, wanted in required}:
-                logging.getLogger(__name__).warning("%s could not be loaded: %s", plugin.file, plugin.error)
+        named = {wanted for _, wanted in required}
+        for plugin in self.registry.broken():  # it may have nothing to do with this recipe
+            if not named & {plugin.file or plugin.name, plugin.distribution}:
+                told = plugin.file or f"the plugin {plugin.origin}"
+                logging.getLogger(__name__).warning("%s could not be loaded: %s", told, plugin.error)
         resolved = [
             str((self.document.folder / n).resolve()) if (self.document.folder / n).exists() else n for n in names
         ]
