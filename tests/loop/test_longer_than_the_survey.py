@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
-from loop_cases import linear_state, synthetic
+from loop_cases import BASE, linear_state, scenario, synthetic, verdict_of
 
 from magtensor.error_models import first_order
 from magtensor.loop.searching import rivals
@@ -87,3 +89,19 @@ def test_a_channel_that_shows_nothing_beside_courses_of_time_is_a_drift_through_
     assert slow.passes and hardly_begun(slow.model, state.excitation)
     told = beside_time(slow, state)
     assert not told.seen and "a drift like any other" in told.refused
+
+
+def test_the_sum_of_a_current_over_time_is_no_lag(tmp_path: Path) -> None:
+    """Iron that a current magnetises a little more each second: as a response that lags by many surveys, with a drift
+    that takes off most of it again, it would go anywhere in another survey."""
+
+    def summed(path: Path) -> None:
+        with h5py.File(path, "a") as file:
+            done = np.cumsum(file["current_heater"][:]) * np.median(np.diff(file["time"][:]))
+            vectors = 0.004 * np.random.default_rng(8).standard_normal((4, 3))
+            file["b_raw"][:] = file["b_raw"][:] + done[:, None, None] * vectors
+
+    survey = scenario(23, motion=BASE["motion"] | {"duration_s": 600.0})
+    told = verdict_of(tmp_path, survey, summed, ["offset_drift", "channel_response", "current_field"])
+    assert all(a["settings"].get("lag_s", 0.0) < 600.0 for a in told["adopted"])
+    assert "follows the sum of current_heater over time" in told["unexplained"]["description"]

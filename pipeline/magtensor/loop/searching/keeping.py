@@ -120,6 +120,10 @@ def why_not(record: Record, before: Trial, after: Trial, chosen: Candidate, how:
     if hardly_begun(model, x) and ((not slow and chosen.moved is None) or began_with_a_vector(model)):
         # of two of a kind one may be slow, and so may what was so at first sight, unless it is all that dies away
         return "fitted, it lags by more than half of the survey: any drift would do as well"
+    if channels and hardly_begun(model, x, share=1.0):
+        return (
+            f"fitted, it lags by more than the survey lasts: it follows the sum of {' and '.join(channels)} over time"
+        )
     if at_its_limit(model.component, model.settings, x):
         return "fitted, it would have begun as far from what it follows as is possible: something else dies away"
     if shorter := _shorter_than_shown(model, x):

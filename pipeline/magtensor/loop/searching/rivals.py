@@ -161,6 +161,16 @@ def part_of_a_drift(candidate: Candidate, candidates: Sequence[Candidate], state
     return None
 
 
+def events_like(lasting: Candidate, events: Sequence[Candidate], state: State) -> set[str]:
+    """Names of those events, each a part of what lasts, that the data do not tell from it."""
+
+    def predicts_as_much(event: Candidate) -> bool:
+        whole, own, _ = _beside(event, lasting, state)
+        return own > whole - SEPARATION
+
+    return {event.model.name for event in events if predicts_as_much(event)}
+
+
 def _judged_by_its_part(lasting: Candidate, event: Candidate, state: State) -> Candidate:
     """What lasts and follows a channel, as it stands beside an event that passes and is a part of it: judged on the
     event's own folds. Of a drift the event says no more than that something moved."""
@@ -216,11 +226,11 @@ def lasting_instead(chosen: Candidate, possible: Sequence[Candidate]) -> Candida
     return max(better, key=lambda c: c.assessment.gain.total, default=chosen)
 
 
-def hardly_begun(model: Adopted, x: Excitation) -> bool:
-    """Whether a response lags by half the survey or more: what it followed was over before it began, and a channel seen
-    through such a lag can be any drift."""
+def hardly_begun(model: Adopted, x: Excitation, share: float = SLOW) -> bool:
+    """Whether a response lags by a share of the survey or more: from a half on what it followed was over before it
+    began, and a channel seen through such a lag can be any drift."""
     found = beginning(model.component, model.settings)
-    return found is not None and float(model.settings[found[1].lag]) > SLOW * x.duration
+    return found is not None and float(model.settings[found[1].lag]) > share * x.duration
 
 
 def still_settling(model: Adopted, x: Excitation) -> bool:

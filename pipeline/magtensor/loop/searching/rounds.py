@@ -41,6 +41,7 @@ from magtensor.loop.searching.rivals import (
     as_predictive,
     by_a_worse_log,
     containing,
+    events_like,
     hindered_by_another,
     overlaps,
     part_of,
@@ -238,7 +239,8 @@ class Rounds:
                     left += by_any_law_of(channel, before.state, self.open_models(before.state), self.alpha)
                 continue
             alike = as_predictive(chosen, candidates, before.state) | by_a_worse_log(chosen, outdone, before.state)
-            rivals = tuple(sorted({*rivals, *alike}))
+            in_it = [c for c in candidates if refused.get(c.model.name) == AS_LASTING.format(chosen.model.name)]
+            rivals = tuple(sorted({*rivals, *alike, *events_like(chosen, in_it, before.state)}))
             if not time.seen:
                 rivals = tuple(sorted({*rivals, *rivals_in_time(chosen, possible, before.state)}))
             if self.say is not None:
