@@ -66,9 +66,12 @@ def test_what_one_direction_leaves_of_matrices() -> None:
 
 def test_what_one_direction_leaves_by_chance_goes_by_how_many_matrices_there_are() -> None:
     apart = np.random.default_rng(4).standard_normal((4, 3, 3))
-    alike = np.repeat(apart[:1], 4, axis=0)
-    assert 0.2 < left_by_chance(apart[:1]) < left_by_chance(apart) < 2.0 / 3.0
-    assert left_by_chance(alike) == pytest.approx(left_by_chance(apart[:1]), rel=0.1)
+    alike, known = np.repeat(apart[:1], 4, axis=0), np.eye(36)
+    assert 0.2 < left_by_chance(apart[:1], known[:9, :9]) < left_by_chance(apart, known) < 2.0 / 3.0
+    assert left_by_chance(alike, known) == pytest.approx(left_by_chance(apart[:1], known[:9, :9]), abs=0.06)
+    # where the survey shows one column of the matrices alone, that is one direction
+    column = np.diag(np.tile([1.0, 1e-6, 1e-6], 12))
+    assert left_by_chance(apart, column) < 1e-3
 
 
 def test_iron_that_all_sensors_have_alike_is_iron() -> None:
