@@ -94,6 +94,7 @@ EFFECTS: dict[str, dict[str, Any]] = {
     "reference_clock": {},
     "reference_drift": {"settles_s": 900.0},
     "reference_step": {"time_s": [700.0]},
+    "reference_while": {"time_s": [600.0, 1000.0]},
     "passing_source": {"time_s": 900.0, "closest_m": [12.0, 0.0, 0.0], "velocity_m_s": [0.0, 0.5, 0.0]},
 }
 ALIKE = " alike"  # behind an effect's name: with the same coefficients in all sensors
@@ -135,7 +136,7 @@ FAMILIES = (
     ("hysteresis", "sampling_lag", "lag_step", "eddy_current", "bandwidth", "clock_drift", "viscous_magnetisation"),
     ("current_field", "moving_part", "periodic_interference", "frame_flexure", "channel_response", "latent_source"),
     ("fixed_source", "site_gradient"),
-    ("reference_clock", "reference_drift", "reference_step"),
+    ("reference_clock", "reference_drift", "reference_step", "reference_while"),
 )  # those of one family may imitate each other
 STAGES = "title: study\nstages: [load, {detrend_diurnal: {uncovered: mask, despike: 8}}]\n"
 
@@ -159,11 +160,13 @@ def model_of(effect: str) -> str:
 
 
 def _described(effect: str, rms: float, seed: int) -> list[dict[str, Any]]:
-    """An effect of some rms (nT) for the simulator; an offset for a while is two jumps of opposite sign."""
+    """An effect of some rms (nT) for the simulator; what is for a while is two jumps of opposite sign."""
     if effect.endswith(ALIKE):
         name = model_of(effect)
         settings = {key: value for key, value in EFFECTS[name].items() if key != "sensors"}
         return [{"type": name, "rms_nT": rms, "alike": True} | settings]
+    if effect == "reference_while":
+        return [{"type": "reference_step", "steps_nT": [1.0, -1.0], "rms_nT": rms} | EFFECTS[effect]]
     if effect != "offset_while":
         return [{"type": effect, "rms_nT": rms} | EFFECTS[effect]]
     first, last = EFFECTS[effect]["time_s"]

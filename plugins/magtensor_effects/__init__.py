@@ -30,7 +30,13 @@ from magtensor_effects.mechanics import (
     turn_step,
 )
 from magtensor_effects.power import current_field, supply_offset, supply_scale
-from magtensor_effects.reference import reference_clock, reference_drift, reference_scale, reference_step
+from magtensor_effects.reference import (
+    reference_clock,
+    reference_drift,
+    reference_scale,
+    reference_step,
+    reference_while,
+)
 from magtensor_effects.site import fixed_source, passing_source, site_gradient
 from magtensor_effects.temperature import temperature_offset, temperature_rate, temperature_scale
 from magtensor_effects.transfer import cross_field, hysteresis, nonlinearity_cubic, nonlinearity_quadratic
@@ -67,6 +73,7 @@ __all__ = [
     "reference_drift",
     "reference_scale",
     "reference_step",
+    "reference_while",
     "sampling_lag",
     "scale_drift",
     "scale_step",

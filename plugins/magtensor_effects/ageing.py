@@ -35,6 +35,10 @@ PARTS = 100.0  # of the span, the first of which the logarithm begins with
 AS_ANOTHER = 0.1  # of a sensor's change: nearer than that to another sensor it is that one
 
 EventTime = Annotated[float, EventTimes(), Field(description="time of the jump, s since the survey's start")]
+OneTime = Annotated[float, EventTimes(20), Field(description="begin or end of the part, s since the survey's start")]
+OtherTime = Annotated[  # grids without a common time
+    float, EventTimes(21, since="time_s"), Field(description="the other one, s")
+]
 
 
 def courses(x: Excitation, order: int, span_s: float, law: str = LAWS[0]) -> list[Array]:
@@ -132,12 +136,8 @@ def offset_step(x: Excitation, *, time_s: EventTime = 0.0) -> Terms:
 def offset_while(
     x: Excitation,
     *,
-    time_s: Annotated[
-        float, EventTimes(20), Field(description="begin or end of the part, s since the survey's start")
-    ] = 0.0,
-    until_s: Annotated[
-        float, EventTimes(21, since="time_s"), Field(description="the other one, s")
-    ] = 60.0,  # grids without a common time
+    time_s: OneTime = 0.0,
+    until_s: OtherTime = 60.0,
 ) -> Terms:
     """Each axis's offset is another one between two times: a tool, a telephone or a magnet lay on the platform.
 

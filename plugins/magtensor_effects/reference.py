@@ -12,7 +12,7 @@ from magtensor.components import error_model
 from magtensor.error_models.excitation import Excitation
 from magtensor.error_models.settings import Delays
 from magtensor.error_models.terms import Terms, joined
-from magtensor_effects.ageing import EventTime, Law, Order, Span, courses
+from magtensor_effects.ageing import EventTime, Law, OneTime, Order, OtherTime, Span, courses
 
 MOST_EXCESS = 0.75  # of the recorded variation: four times that of the site
 NEARBY_S = 2.0  # shorter delays show as the slope over this time
@@ -126,3 +126,23 @@ def reference_step(x: Excitation, *, time_s: EventTime = 0.0) -> Terms:
     """
     since = (x.readings.time - x.start >= time_s).astype(float)
     return x.on_reference(replace(x.readings, field=since).at(x.time), "nT", "step")
+
+
+@error_model(
+    "reference",
+    needs=("base_station",),
+    source="two shifts in level of opposite sign",
+    typical="some nT: a car parked beside the station, a tool left at its sensor, a sensor moved and put back",
+    pointwise=True,
+)
+def reference_while(x: Excitation, *, time_s: OneTime = 0.0, until_s: OtherTime = 60.0) -> Terms:
+    """The base station's level is another one between two times: something magnetic stood beside it.
+
+    One coefficient; each of the two jumps lies between two of the station's readings, as that of `reference_step`.
+    Rivals: `reference_step` where one of the two times is near an end of the survey; `passing_source` for a short
+    time.
+    """
+    first, last = sorted((time_s, until_s))
+    since = x.readings.time - x.start
+    during = ((since >= first) & (since < last)).astype(float)
+    return x.on_reference(replace(x.readings, field=during).at(x.time), "nT", "shift")

@@ -29,7 +29,7 @@ CATALOGUE = {
         "temperature_alignment", "alignment_drift", "channel_alignment",
     },
     "site": {"fixed_source", "site_gradient", "passing_source"},
-    "reference": {"reference_scale", "reference_clock", "reference_drift", "reference_step"},
+    "reference": {"reference_scale", "reference_clock", "reference_drift", "reference_step", "reference_while"},
 }  # fmt: skip
 
 
@@ -70,6 +70,7 @@ NEEDED = {
     "reference_clock": ["base_station"],
     "reference_drift": ["base_station"],
     "reference_step": ["base_station"],
+    "reference_while": ["base_station"],
     "latent_source": ["waveform"],
     "sampling_lag": ["rotation"],
     "eddy_current": ["rotation"],

@@ -533,12 +533,14 @@ def test_finite_baseline_follows_the_bend_along_the_line() -> None:
         ("reference_drift", {"order": 1, "span_s": 180.0}, {"rate_nT_h": 60.0}, 0.01, 1.5),
         # a step between two readings a second apart: ten samples of 1800 are interpolated
         ("reference_step", {"time_s": 60.0}, {"steps_nT": [3.0], "time_s": [60.0]}, 0.1, 3.0),
+        ("reference_while", {"time_s": 110.0, "until_s": 60.0}, {"steps_nT": [3.0, -3.0], "time_s": [60.0, 110.0]}, 0.1,
+         3.0),
     ],
-)
+)  # fmt: skip
 def test_reference(
     name: str, settings: dict[str, Any], effect: dict[str, Any], bound: float, coefficient: float
 ) -> None:
-    survey = simulated(name, **effect)
+    survey = simulated("reference_step" if name == "reference_while" else name, **effect)
     x = excitation(survey)
     assert survey.reference is not None
     added = np.interp(survey.time, survey.reference.time, survey.truth.effects[0].added)
