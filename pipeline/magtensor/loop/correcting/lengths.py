@@ -18,6 +18,7 @@ from magtensor.loop.correcting.correction import corrected_raw
 from magtensor.loop.fitting.model import Adopted, Record
 
 AVERAGING = "averaging"
+FURTHER = 1.01  # times as far from the total field as without an effect, which is then said to be none of the survey's
 HALF = 0.5  # of what the effect takes off the lengths: below it the survey is nearer to having none
 
 
@@ -91,6 +92,9 @@ def _refuted(
     left, course = left - left.mean(axis=0), course - course.mean(axis=0)
     power = float(np.sum(course**2))
     if power <= 0.0:
+        return False
+    # a delay does next to nothing to a length, and what it does is the noise of the rate that it is made of
+    if record.total_field is not None and np.sum((left + course) ** 2) < FURTHER**2 * np.sum(left**2):
         return False
     there = -float(np.sum(left * course)) / power
     products = np.sum((left + there * course) * course, axis=1)  # sums over sensors: what moves all counts once
