@@ -8,18 +8,20 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
-from loop_cases import BASE, adopted_names, linear_state, lines_left, loaded, scenario, verdict_of
+from loop_cases import BASE, adopted_names, linear_state, lines_left, loaded, scenario, survey_file, verdict_of
+
+import magtensor
 
 TONE_HZ = 0.2331
 TILTS = {"type": "limited_tilt", "duration_s": 1200.0, "tilt_deg": 25.0}
 ONE = BASE["instrument"] | {"array": {"positions_m": [[0.0, 0.0, 0.0]], "names": ["S1"]}}
 
 
-def hum(path: Path) -> None:
-    """The field of a coil far off, fixed to the platform."""
+def hum(path: Path, phase: float = 0.7) -> None:
+    """The field of a coil far off, fixed to the platform, as each sensor reads it."""
     with h5py.File(path, "a") as file:
-        tone = np.sin(2.0 * np.pi * TONE_HZ * (file["time"][:] - file["time"][0]) + 0.7)
-        file["b_raw"][:] = file["b_raw"][:] + tone[:, None, None] * [0.5, -0.4, 0.3]
+        tone = np.sin(2.0 * np.pi * TONE_HZ * (file["time"][:] - file["time"][0]) + phase)
+        file["b_raw"][:] = file["b_raw"][:] + tone[:, None, None] * (file["truth/matrix"][:] @ [0.5, -0.4, 0.3])
 
 
 def hum_at_the_station(path: Path) -> None:
@@ -73,3 +75,16 @@ def test_a_drift_of_the_base_station_has_no_lines(tmp_path: Path) -> None:
     record = loaded(tmp_path, scenario(17), drifting)
     assert linear_state(record).residual.along is not None
     assert all(p > 0.01 for *_, p in lines_left(record))
+
+
+def test_a_phase_that_the_sensors_do_not_show_is_not_made_up(tmp_path: Path) -> None:
+    """What all sensors have alike they would have of a field as well: on another survey it is left in, and said so."""
+    survey, other = (survey_file(tmp_path, scenario(s, motion=TILTS), f"{s}.h5") for s in (17, 18))
+    hum(survey)
+    hum(other, phase=2.1)
+    found = magtensor.close_loop(survey, verify=other, search=["periodic_interference"]).verdict
+    assert adopted_names(found) == {"periodic_interference"}
+    verify = found["error"]["verify"]
+    assert "does not show it, and its phase" in verify["not_taken_off"]
+    before, after = (verify[when]["total_field_rms_nT"]["all"] for when in ("before", "after"))
+    assert after < 1.01 * before

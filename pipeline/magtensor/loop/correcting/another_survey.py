@@ -41,7 +41,12 @@ def as_begun_here(
     ----------
     good: (N,) samples that may be believed; all that there are if None.
     """
-    begun = [(a, _tone_here(record, calibration, a, t, good) if a.name == TONE else t) for a, t in own]
+
+    def of_a_tone(model: Adopted, theta: Array) -> Array:
+        here = tone_here(record, calibration, model, theta, good)
+        return np.zeros_like(theta) if here is None else here
+
+    begun = [(a, of_a_tone(a, t) if a.name == TONE else t) for a, t in own]
     begun = [
         (a, _warmth_here(record, calibration, begun, i, good) if a.name == WARM_UP else t)
         for i, (a, t) in enumerate(begun)
@@ -86,15 +91,15 @@ class _Contrast:
         return out
 
 
-def _tone_here(
+def tone_here(
     record: Record, calibration: ArrayCalibration, model: Adopted, theta: Array, good: NDArray[np.bool_] | None
-) -> Array:
+) -> Array | None:
     """Coefficients of a tone with the phase and strength it has on this survey; what one survey began with is another's
     accident.
 
     Found by least squares over the tone as it was and a quarter of a turn later, in what neither a uniform field nor a
-    gradient can make of the outputs (with fewer than four sensors: in their differences). A single sensor, and a tone
-    that all sensors see alike, leave it unknown, and nothing is taken off.
+    gradient can make of the outputs (with fewer than four sensors: in their differences). None where these do not show
+    it: of a single sensor, and of a tone that all sensors see alike.
     """
     contrast = _Contrast.of(record, calibration, good)
     raw = np.nan_to_num(record.raw)
@@ -102,13 +107,20 @@ def _tone_here(
     half = len(theta) // 2  # cosines first, then sines
     later = np.concatenate([theta[half:], -theta[:half]])
     size = raw[0].size
-    both = np.column_stack([contrast(terms.contribution(t, size).reshape(raw.shape)).ravel() for t in (theta, later)])
+    each = [contrast(terms.contribution(t, size).reshape(raw.shape)) for t in (theta, later)]
+    both = np.column_stack([course.ravel() for course in each])
     if np.sum(both**2) <= LEAST_CONTRAST * contrast.usable.sum() * float(theta @ theta):
-        return np.zeros_like(theta)
+        return None
     strengths = np.linalg.svd(both.T @ both, compute_uv=False)
-    if strengths[1] < LEAST_CONTRAST * strengths[0]:  # a tone that the sampling shows as a constant has no phase
+    still = all(np.sum((course - course.mean(axis=0)) ** 2) < LEAST_CONTRAST * strengths[0] for course in each)
+    if still:  # a tone that the sampling shows as a constant has no phase
         return theta
-    own = np.linalg.lstsq(both, contrast(raw - calibration.offset).ravel(), rcond=1e-6)[0]
+    found = contrast(raw - calibration.offset).ravel()
+    own = np.linalg.lstsq(both, found, rcond=LEAST_CONTRAST)[0]
+    noise = float(np.mean((found - both @ own) ** 2))
+    scatter = noise * np.linalg.pinv(both.T @ both, rcond=LEAST_CONTRAST, hermitian=True)
+    if SIGNIFICANT**2 * np.diagonal(scatter).max() > min(1.0, float(own @ own)):  # of its strength
+        return None
     out: Array = own[0] * theta + own[1] * later
     return out
 

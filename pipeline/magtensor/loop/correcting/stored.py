@@ -16,7 +16,7 @@ from magtensor.error_models.needs import FACTS
 from magtensor.error_models.settings import NOT_KNOWN, AnyChannel, Beginning, Duration, EventTimes, profiled
 from magtensor.error_models.waveform import NAME
 from magtensor.errors import DataError, UsageError
-from magtensor.loop.correcting.another_survey import TONE, WARM_UP, shows_a_state, unknown
+from magtensor.loop.correcting.another_survey import TONE, WARM_UP, shows_a_state, tone_here, unknown
 from magtensor.loop.correcting.beyond import extrapolated, seen_here
 from magtensor.loop.correcting.correction import corrected_raw, corrected_reference, hidden_objection
 from magtensor.loop.correcting.dates import LONG, as_dated_here
@@ -198,7 +198,7 @@ def those_here(
     here = Here(list(adopted), list(theta), beyond, "", left_in(survey, adopted))
     if "total_field" not in survey:
         beyond = {}  # lengths alone change with the field
-    asked = {AVERAGING, NAME, *beyond} & {a.name for a in adopted}
+    asked = {AVERAGING, NAME, TONE, *beyond} & {a.name for a in adopted}
     record = record_of(survey, origins=origins, every=True) if asked else None
     if record is None or any(a.component.effect != "site" and _lacking(a, record) for a in adopted):
         return here  # what it lacks is told when the effects are taken off
@@ -209,6 +209,10 @@ def those_here(
         if asked_here and refuted(name, record, fitted, here.adopted, here.theta, survey.good):
             why = f"{name} ({beyond[name]})" if name in beyond else name
             here = _without(here, name, refuted="; ".join(w for w in (here.refuted, why) if w))
+    tones = [(a, t) for a, t in zip(here.adopted, here.theta, strict=True) if a.name == TONE]
+    if len(survey.sensors) > 1 and any(tone_here(record, fitted, a, t, survey.good) is None for a, t in tones):
+        words = f"{TONE}: what differs between the sensors does not show it, and its phase, on this survey"
+        here = replace(here, left_in="; ".join(w for w in (here.left_in, words) if w))
     if NAME in asked and (why := hidden_objection(record, fitted, here.adopted, here.theta, survey.good)):
         words = f"{NAME}: {why}"
         here = _without(here, NAME, left_in="; ".join(w for w in (here.left_in, words) if w))
