@@ -9,7 +9,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from loop_cases import Array, adopted_names, linear_state, loaded, scenario, synthetic, verdict_of
+from loop_cases import BASE, Array, adopted_names, linear_state, loaded, scenario, synthetic, verdict_of
 
 from magtensor.loop.evidence.stretches import louder_in, too_loud_in
 from magtensor.loop.fitting.model import Fitting
@@ -131,3 +131,20 @@ def test_of_the_loud_samples_those_that_even_this_noise_does_not_explain_are_fla
 def test_an_even_survey_has_no_loud_stretches() -> None:
     record = synthetic(5, 1500, turning_s=4.0, noise_nT=0.15)
     assert loud_stretches(record, linear_state(record), Fitting()) == ()
+
+
+@pytest.mark.parametrize("seed", [3, 5])
+def test_events_within_the_noise_of_one_loud_sensor_are_not_told_of(seed: int, tmp_path: Path) -> None:
+    def loud(path: Path) -> None:
+        rng = np.random.default_rng(seed)
+        with h5py.File(path, "a") as file:
+            raw, since = file["b_raw"][:], file["time"][:] - file["time"][0]
+            part = (since > 360.0) & (since < 390.0)
+            raw[part, 1] += rng.normal(0.0, 1.8, raw[part, 1].shape)
+            file["b_raw"][:] = raw
+
+    survey = scenario(seed, rate_Hz=8.0, motion=BASE["motion"] | {"duration_s": 500.0})
+    told = verdict_of(tmp_path, survey, loud, ["offset_while", "passing_source", "offset_step"])
+    assert not told["adopted"] and not told["unexplained"]["present"], told["unexplained"]["description"]
+    assert told["unexplained"]["looks_like"] == []
+    assert "the noise of S2 is" in told["unexplained"]["description"]

@@ -12,9 +12,10 @@ from loop_cases import Array, linear_state, looked_at, synthetic
 from magtensor.loop.fitting.model import Adopted, Fitting, Record
 from magtensor.loop.fitting.refit import joint_state, loud_stretches, rounding
 from magtensor.loop.remainder.flagged import flagged_words
+from magtensor.loop.remainder.loud import Loud
 from magtensor.loop.remainder.predictable import converter_words
 from magtensor.loop.searching.found import Search, Step
-from magtensor.loop.searching.unexplained import loud_words, unexplained
+from magtensor.loop.searching.unexplained import unexplained
 from magtensor.registry import Registry
 from magtensor.verdict import sentence
 
@@ -57,11 +58,11 @@ def test_noise_that_is_louder_for_a_while_is_dated() -> None:
     added = np.zeros((SAMPLES, 4, 3))
     added[1000:1400, 2] = 0.6 * rng.standard_normal((400, 3))
     record = synthetic(3, SAMPLES, turning_s=4.0, noise_nT=0.15, added=added)
-    (words,) = loud_words(linear_state(record), record, Fitting())
+    (words,) = Loud.of(linear_state(record), record, Fitting()).words
     begin, end = (float(words.split()[i]) for i in (1, 3))
     assert "the noise of S3" in words and begin == pytest.approx(1000, abs=15) and end == pytest.approx(1400, abs=15)
     quiet = synthetic(3, SAMPLES, turning_s=4.0, noise_nT=0.15)
-    assert loud_words(linear_state(quiet), quiet, Fitting()) == []
+    assert Loud.of(linear_state(quiet), quiet, Fitting()).words == []
 
 
 def test_noise_that_grows_is_told() -> None:
@@ -70,7 +71,7 @@ def test_noise_that_grows_is_told() -> None:
     added = np.zeros((SAMPLES, 4, 3))
     added[:, 1] = np.linspace(0.0, 0.6, SAMPLES)[:, None] * rng.standard_normal((SAMPLES, 3))
     record = synthetic(4, SAMPLES, turning_s=4.0, noise_nT=0.15, added=added)
-    (words,) = loud_words(linear_state(record), record, Fitting())
+    (words,) = Loud.of(linear_state(record), record, Fitting()).words
     times, here, there = (float(words.split()[i]) for i in (5, 10, 16))
     assert "the noise of S2 is" in words
     assert times == pytest.approx(np.hypot(0.57, 0.15) / np.hypot(0.03, 0.15), rel=0.2)  # the last tenth and the first
@@ -272,7 +273,7 @@ def test_outputs_in_coarse_steps_have_no_loud_stretches() -> None:
     coarse = replace(clean, raw=np.round(at_rest / 2.0) * 2.0)
     state = linear_state(coarse)
     assert loud_stretches(coarse, state, Fitting()) == ()
-    (words,) = loud_words(state, coarse, Fitting())
+    (words,) = Loud.of(state, coarse, Fitting()).words
     assert words == "the outputs come in steps of 2 nT, and rounding makes more of what is left than noise"
     assert rounding(clean, linear_state(clean)) == 0.0
 

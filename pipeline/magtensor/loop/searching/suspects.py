@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from magtensor.calibration.types import Mask
@@ -38,14 +39,23 @@ class Suspects:
     nearest: list[str]
 
     @classmethod
-    def of(cls, found: Search, flagged: Mask, known: Mask, sparse: SparseReadings | None) -> Suspects:
+    def of(
+        cls,
+        found: Search,
+        flagged: Mask,
+        known: Mask,
+        sparse: SparseReadings | None,
+        loud: Sequence[tuple[float, float]] = (),
+    ) -> Suspects:
         """Of a search that has ended.
 
         Parameters
         ----------
         flagged: (N,) samples that no calibration fits; known: (N,) the same of which it is known why.
+        loud: begin and end, s after the start, of louder noise: an event in it that predicts nothing is a part of that.
         """
         last = found.steps[-1].candidates if found.steps else ()
+        last = tuple(c for c in last if c.passes or not _in_one_of(loud, c))
         refused = found.steps[-1].refused if found.steps else {}
         seen = [c for c in last if c.passes or unlikely(c)]
         if flagged.any() or known.any():  # while effects were sought, what lasts was believed
@@ -108,6 +118,12 @@ class Suspects:
             f"{' and '.join(self.small)}: significant, and less than {SECOND_ORDER**0.5:.1%} of the size of what is "
             "adopted, whose law may miss as much"
         ]
+
+
+def _in_one_of(stretches: Sequence[tuple[float, float]], candidate: Candidate) -> bool:
+    """Whether what happened once did so within one stretch."""
+    when = moments(candidate.model) if happens_once(candidate.model) else []
+    return bool(when) and any(begin <= when[0] and when[-1] <= end for begin, end in stretches)
 
 
 def unlikely(candidate: Candidate) -> bool:

@@ -7,19 +7,16 @@ sensor whose matrix is not constant, or an error model that is significant and w
 
 from __future__ import annotations
 
-from dataclasses import replace
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
 from magtensor.calibration.types import Array
 from magtensor.loop.evidence.own_noise import OwnNoise
-from magtensor.loop.evidence.residual import Residual, residual_of
+from magtensor.loop.evidence.residual import Residual
 from magtensor.loop.evidence.spectrum import spectral_lines
-from magtensor.loop.evidence.stretches import ABOUT, LEAST_LOUD
-from magtensor.loop.fitting.model import Fitting, Record, State
-from magtensor.loop.fitting.refit import disturbed, rounding, without
+from magtensor.loop.fitting.model import Record, State
+from magtensor.loop.fitting.refit import disturbed
 from magtensor.loop.remainder.changing_matrix import changing_matrices
 from magtensor.loop.remainder.excess import excess_rms
 from magtensor.loop.remainder.flagged import (
@@ -33,6 +30,7 @@ from magtensor.loop.remainder.flagged import (
 )
 from magtensor.loop.remainder.gradient_shape import MODEL, gradient_share
 from magtensor.loop.remainder.jitter import jitter_words
+from magtensor.loop.remainder.loud import Loud
 from magtensor.loop.remainder.outlying import Outlying, outlying_words, spike_words
 from magtensor.loop.remainder.predictable import attitude_words, converter_words, shortened_words
 from magtensor.loop.remainder.sparse_readings import SparseReadings, sparse_readings
@@ -48,8 +46,6 @@ OF_A_LINE = 0.1  # of the square of what is left above the noise: less than that
 MUCH = 3.0  # times the white noise of an output: no base station beside a site differs by so much unnoticed
 TWICE = 2.0  # what the slow noise of the sensors, known from few frequencies, makes of it
 NO_NOISE = 5.0  # times the white noise: of noise whose power goes with 1/f the slow part has three at most
-LOUD = 2.0  # times the usual noise
-PARTS = 10  # of a survey, that are compared
 NOISE = "what is left is noise: white, and slow noise of each sensor alone or of the reference"
 
 
@@ -62,7 +58,8 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
     starts, paused = after_pauses(bad, state.excitation)
     played, began = before_the_play(bad, state)
     flagged = lasting(bad, played) | starts
-    suspects = Suspects.of(found, flagged, played, sparse)
+    loud = Loud.of(state, record, found.how)
+    suspects = Suspects.of(found, flagged, played, sparse, loud.stretches)
     outlying = Outlying.of(state, record)
     too_often, theirs = outlying_words(outlying, ~np.asarray(state.fit.keep))
     words = [*_what_shows(found, record, excess, sparse), *suspects.words, *too_often]
@@ -72,7 +69,7 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
             f"it is slow, and {times:.2g} times the white noise, where noise with a power of 1/f has three at most: "
             "what moved there follows nothing that is logged"
         )
-    beside = [*loud_words(state, record, found.how), *unread_words(state, record)]
+    beside = [*loud.words, *unread_words(state, record)]
     gradient = gradient_share(state, record.position)
     shaped = bool(words) and gradient > 0
     if shaped:
@@ -192,72 +189,6 @@ def _slow(state: State, record: Record) -> float:
     if state.residual.across is not None:
         return slow_across(state.residual)
     return max(slow_along(state) ** 2 - of_the_station(state, record) ** 2, 0.0) ** 0.5
-
-
-def loud_words(state: State, record: Record, how: Fitting) -> list[str]:
-    """Where the noise of a sensor is louder for a while: no effect, but worth a look."""
-    from scipy.ndimage import median_filter
-
-    if step := rounding(record, state):
-        return [f"the outputs come in steps of {step:.3g} nT, and rounding makes more of what is left than noise"]
-    if state.residual.across is None or len(state.residual.across) < 4 * LEAST_LOUD:
-        return []
-    seen = state.residual
-    if how.without:
-        raw, reference = without(record, [a.terms(state.excitation) for a in state.adopted], state.theta)
-        believed = state.fit.keep | ~how.among(record.time)
-        seen = residual_of(replace(state.fit, keep=believed), raw, reference, how.reference_noise)
-    assert seen.across is not None
-    names = state.excitation.sensors
-    pairs = (
-        [(" and ".join(names), slice(None))]
-        if len(names) == 2
-        else [  # two have one contrast
-            (name, slice(3 * number, 3 * number + 3)) for number, name in enumerate(names)
-        ]
-    )
-    words = []
-    for name, own in pairs:
-        steps = np.sum(np.diff(seen.across[:, own], axis=0) ** 2, axis=1)
-        rough = median_filter(steps, size=ABOUT, mode="mirror")
-        usual = float(np.median(rough))
-        loud = rough > LOUD**2 * usual
-        edges = np.flatnonzero(np.diff(loud.astype(int), prepend=0, append=0)).reshape(-1, 2)
-        found = [(first, end) for first, end in edges if end - first >= LEAST_LOUD]
-        if not found:
-            words += growing_words(name, steps, record.time[seen.samples] - record.start)
-            continue
-        first, end = max(found, key=lambda stretch: stretch[1] - stretch[0])
-        begin, until = (record.time[seen.samples[i]] - record.start for i in (first, end))
-        times = float(np.sqrt(np.median(rough[first:end]) / usual))
-        others = f", and in {len(found) - 1} shorter stretches" if len(found) > 1 else ""
-        words.append(
-            f"from {begin:.5g} to {until:.5g} s the noise of {name} is {times:.2g} times as loud as usual{others}"
-        )
-    if how.without:
-        count = int(np.sum(~how.among(record.time)))
-        words.append(
-            f"{count} samples in which most sensors are so loud have no part in the calibration, which is better "
-            "without them"
-        )
-    return words
-
-
-def growing_words(name: str, steps: Array, elapsed: Array) -> list[str]:
-    """Whether noise is much louder in one tenth of a survey than in another, as where it grows all the time.
-
-    Parameters
-    ----------
-    steps: (n - 1,) squares of the steps from one sample to the next; elapsed: (n,) s.
-    """
-    edges = np.linspace(0, len(steps), PARTS + 1).round().astype(int)
-    loudness = np.array([np.median(steps[i:j]) for i, j in pairwise(edges)])
-    quiet, loud = int(loudness.argmin()), int(loudness.argmax())
-    if np.diff(edges).min() < LEAST_LOUD or loudness[loud] < LOUD**2 * loudness[quiet]:
-        return []
-    times = float(np.sqrt(loudness[loud] / loudness[quiet]))
-    here, there = (f"from {elapsed[edges[k]]:.5g} to {elapsed[edges[k + 1]]:.5g} s" for k in (loud, quiet))
-    return [f"the noise of {name} is {times:.2g} times as loud {here} as {there}"]
 
 
 def strongest_line(state: State, record: Record) -> tuple[float, float] | None:
