@@ -119,11 +119,17 @@ def _harmonic(name: str, places: Array) -> Array:
     return out
 
 
+def _or_at_the_station(_: Excitation, settings: Mapping[str, Any], __: Mapping[tuple[str, str], float]) -> str:
+    """Where else it may have passed: a gradient at the rig alone would tell."""
+    return "" if settings.get("whole") else "in |b| - F alone: it may have passed the base station instead"
+
+
 @error_model(
     "site",
     source="dipole on a straight track: Anderson functions",
     typical="a car of 200 A m2: 20 nT at 10 m for some seconds",
     pointwise=True,
+    means=_or_at_the_station,
 )
 def passing_source(
     x: Excitation,
@@ -146,7 +152,8 @@ def passing_source(
     With u = (t - time_s) / passage_s its field is a combination of 1, u, u^2 over (1 + u^2)^(5/2) in every component,
     whatever the moment, the track and the distance; its gradient one of 1, u, u^2, u^3 over (1 + u^2)^(7/2). Of the
     field common to all sensors only the component along the Earth's shows beside a base station: three coefficients.
-    With `whole` nine for the vector in the world and twenty for its gradient.
+    With `whole` nine for the vector in the world and twenty for its gradient. Without it the same that passes the base
+    station, with the other sign, is not told from it; nor is a base station that is restless for as long.
     """
     u = (x.elapsed - time_s) / passage_s
     dipole = [u**k / (1 + u**2) ** 2.5 for k in range(3)]

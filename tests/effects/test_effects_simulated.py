@@ -620,3 +620,11 @@ def test_shifts_that_are_a_turn_of_the_array() -> None:
     assert of(turned + np.array([1.0, -2.0, 3.0])).startswith("100%")  # a shift of all does not show
     assert of(1e3 * 0.01 * x.position) == ""
     assert means(x, {}, {("S1", a): 1.0 for a in "xyz"} | {("S2", a): 2.0 for a in "xyz"}) == ""
+
+
+def test_a_passage_that_no_gradient_tells_may_have_been_at_the_base_station() -> None:
+    x = excitation(simulated("offset_step", nT=[0.0, 0.0, 0.0], time_s=[50.0]))
+    means = model("passing_source").means
+    assert means is not None
+    assert "the base station instead" in means(x, {"time_s": 50.0, "passage_s": 5.0, "whole": False}, {})
+    assert means(x, {"time_s": 50.0, "passage_s": 5.0, "whole": True}, {}) == ""
