@@ -109,6 +109,7 @@ OWN_TO_NO_SENSOR = {
     "reference_clock",
     "reference_drift",
     "reference_step",
+    "reference_while",
 }  # that have no coefficients of each sensor, or draw none
 EVERY_EFFECT = [*EFFECTS, *(effect + ALIKE for effect in EFFECTS if effect not in OWN_TO_NO_SENSOR)]
 FAMILIES = (

@@ -1,4 +1,4 @@
-"""Two effects of which each hides something of the other, as the study makes them."""
+"""The study of the loop's power, on a few of its surveys."""
 
 from __future__ import annotations
 
@@ -10,6 +10,9 @@ import pytest
 sys.path.insert(0, str(Path(__file__).parents[2] / "studies"))
 
 import loop_power
+from loop_surveys import EVERY_EFFECT, scenario
+
+from magtensor.simulate import simulate
 
 
 @pytest.mark.long
@@ -25,3 +28,11 @@ def test_an_effect_of_all_sensors_alike_is_judged_by_its_model() -> None:
     )
     assert row["outcome"] == "right" and row["adopted"] == ["nonlinearity_quadratic"]
     assert row["oracle"] < 1e-6
+
+
+def test_every_effect_of_the_studies_can_be_simulated() -> None:
+    short = {"type": "tumbling", "duration_s": 1100.0, "rate_rms_deg_s": 20.0, "rate_time_s": 4.0}
+    for effect in EVERY_EFFECT:
+        made = scenario("tumbling", 0.0, 1, effect, 1.0) | {"rate_Hz": 1.0, "motion": short}
+        if effect not in ("reference_clock", "reference_scale"):  # as large as asked they are longer than that
+            assert simulate(made).truth.effects[0].rms_nT > 0, effect
