@@ -58,7 +58,10 @@ def test_one_offset_of_all_sensors_turns_with_the_platform_if_that_turns(turning
     [
         {"type": "temperature_offset", "nT_per_degC": [0.3, 0.2, 0.1]},
         pytest.param({"type": "temperature_scale", "ppm_per_degC": [10.0, 16.0, 7.0]}, marks=pytest.mark.long),
-        {"type": "current_field", "channel": "current_heater", "nT_per_A": [0.4, -0.3, 0.5]},
+        pytest.param(
+            {"type": "current_field", "channel": "current_heater", "nT_per_A": [0.4, -0.3, 0.5]},
+            marks=pytest.mark.long,
+        ),
     ],
 )
 def test_what_every_sensor_has_alike_is_found_where_the_platform_turns(effect: dict[str, Any], tmp_path: Path) -> None:

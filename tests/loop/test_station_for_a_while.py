@@ -16,7 +16,10 @@ MODELS = [
 OFF: dict[str, Any] = {"type": "reference_step", "steps_nT": [1.2, -1.2], "time_s": [FROM_S, UNTIL_S]}
 
 
-@pytest.mark.parametrize("motion", [None, {"type": "limited_tilt", "duration_s": 1200.0, "tilt_deg": 25.0}])
+@pytest.mark.parametrize(
+    "motion",
+    [pytest.param(None, marks=pytest.mark.long), {"type": "limited_tilt", "duration_s": 1200.0, "tilt_deg": 25.0}],
+)
 def test_a_level_that_comes_and_goes_is_one_effect(motion: dict[str, Any] | None, tmp_path: Path) -> None:
     sections = {} if motion is None else {"motion": motion}
     told = verdict_of(tmp_path, scenario(31, OFF, **sections), models=MODELS)
@@ -36,6 +39,7 @@ def test_a_tool_on_the_platform_is_none_of_the_station(tmp_path: Path) -> None:
     assert adopted_names(told) == {"offset_while"}
 
 
+@pytest.mark.long
 def test_a_station_that_stays_where_it_went_has_stepped(tmp_path: Path) -> None:
     stays = OFF | {"steps_nT": [1.2], "time_s": [FROM_S]}
     told = verdict_of(tmp_path, scenario(31, stays), models=MODELS)
