@@ -45,7 +45,7 @@ class Suspects:
         flagged: Mask,
         known: Mask,
         sparse: SparseReadings | None,
-        loud: Sequence[tuple[float, float]] = (),
+        loud: Sequence[tuple[float, float]],
     ) -> Suspects:
         """Of a search that has ended.
 
