@@ -42,6 +42,20 @@ def test_what_is_on_or_off_has_no_noise_and_a_coarse_reading_has() -> None:
     np.testing.assert_allclose(white_noise(21.0 + switch, run), 1.0 / np.sqrt(12.0))
 
 
+def test_levels_that_were_set_are_exact_and_those_of_a_rounded_course_are_not() -> None:
+    rng, every = np.random.default_rng(8), 40
+    run = np.zeros(60 * every, dtype=int)
+    stage = np.zeros(60, dtype=int)
+    for i in range(1, len(stage)):  # a heater of three stages, switched to any of the others
+        stage[i] = (stage[i - 1] + rng.integers(1, 3)) % 3
+    heater = 0.8 * np.repeat(stage, every)
+    wander = np.interp(np.arange(len(run)), np.arange(0, len(run), 300), np.cumsum(rng.normal(0.0, 1.5, 8)))
+    heats = 20.0 + 30.0 * (1.0 - np.exp(-(np.arange(len(run)) // 300) / 2.0))  # read every 300 samples: jumps, once
+    np.testing.assert_array_equal(white_noise(heater, run), 0.0)
+    np.testing.assert_allclose(white_noise(np.round(wander), run), 1.0 / np.sqrt(12.0))
+    assert white_noise(np.round(heats), run) >= 1.0 / np.sqrt(12.0)
+
+
 @pytest.mark.long
 def test_a_range_that_is_logged_changes_offset_and_scale_of_a_sensor(tmp_path: Path) -> None:
     """An offset beside a scale that follows the same bit is not explained by noise of a log that has none."""

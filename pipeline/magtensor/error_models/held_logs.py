@@ -29,7 +29,7 @@ def unheld(time: Array, values: Array) -> Array:
     if len(changed) < LEAST_READINGS or len(values) < LEAST_HELD * len(changed):
         return smoothed(time, values)
     at, readings = time[changed], values[changed]
-    if _rounded(readings):
+    if by_single_steps(readings):
         return unrounded(time, values)
     interval = np.diff(at)
     usual = float(np.median(interval))
@@ -60,7 +60,8 @@ def unrounded(time: Array, values: Array) -> Array:
     return np.interp(time, points[order], course[order])
 
 
-def _rounded(readings: Array) -> bool:
-    """Whether a series that changes at these readings does so by one step at a time."""
+def by_single_steps(readings: Array) -> bool:
+    """Whether a series that changes at these readings does so by one step at a time, as what is slow does once it is
+    rounded."""
     steps = np.abs(np.diff(readings))
     return bool(np.mean(steps < STEPS_APART * steps.min()) >= ONE_STEP)

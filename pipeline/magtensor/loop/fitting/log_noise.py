@@ -16,7 +16,10 @@ from numpy.typing import NDArray
 
 from magtensor.calibration.noise import MAD_TO_SIGMA
 from magtensor.calibration.types import Array
+from magtensor.error_models.held_logs import by_single_steps
 from magtensor.loop.fitting.model import Adopted, State
+
+TWICE = 2.0  # on average
 
 
 def white_noise(values: Array, run: NDArray[np.int_]) -> Array:
@@ -24,8 +27,9 @@ def white_noise(values: Array, run: NDArray[np.int_]) -> Array:
 
     From second differences within runs, by their median, so that jumps count as signal; less where values two apart
     differ by more than neighbours do, as those of a channel that wanders: white noise is the part that does not grow.
-    At least the noise of the resolution where the values are rounded; what is zero or one other value is on or off, and
-    exact.
+    At least the noise of the resolution where the values are rounded, and so change by one step of it at a time; what
+    jumps over levels, and comes to each of them twice or more, was set to them, and is exact, as what is zero or one
+    other value, on or off.
     """
     columns = values.reshape(len(values), -1)
     out = np.zeros(columns.shape[1])
@@ -36,10 +40,13 @@ def white_noise(values: Array, run: NDArray[np.int_]) -> Array:
         second = np.abs(np.diff(columns, n=2, axis=0)[within]) / np.sqrt(6.0)
         out = np.minimum(MAD_TO_SIGMA * np.median(second, axis=0), _that_does_not_grow(columns, run))
     for j, column in enumerate(columns.T):
-        steps = np.abs(np.diff(column))
-        steps = steps[steps > 1e-9 * max(float(np.ptp(column)), 1e-300)]
-        if out[j] == 0 and len(steps) and not _on_or_off(column):
-            out[j] = steps.min() / np.sqrt(12.0)
+        if out[j] > 0 or _on_or_off(column):
+            continue
+        changed = np.abs(np.diff(column)) > 1e-9 * max(float(np.ptp(column)), 1e-300)
+        readings = column[np.flatnonzero(np.append(changed, True))]
+        came_back = len(readings) >= TWICE * len(np.unique(readings))
+        if len(readings) > 1 and (by_single_steps(readings) or not came_back):
+            out[j] = np.abs(np.diff(readings)).min() / np.sqrt(12.0)
     return out
 
 
