@@ -81,6 +81,25 @@ def test_a_field_of_the_platform_turns_and_an_error_of_the_station_does_not(of_t
     assert turns_with_the_platform(linear_state(record)) is not of_the_station
 
 
+TURNS = "turns with the platform"
+
+
+@pytest.mark.parametrize("seed", [71, 72])
+def test_a_weak_source_on_the_platform_that_nobody_logged_is_told(seed: int, tmp_path: Path) -> None:
+    """One vector in all sensors, less than three times their noise of |b| - F: no base station could be so."""
+    rng = np.random.default_rng(seed)
+    on = np.cumsum(rng.random(2400) < 1 / 120.0) % 2  # one that switches once a minute
+
+    def switched(path: Path) -> None:
+        with h5py.File(path, "a") as file:
+            file["b_raw"][:] = file["b_raw"][:] + on[: len(file["time"]), None, None] * np.array([0.6, -0.5, 0.4])
+
+    source = verdict_of(tmp_path, scenario(seed), switched, ["current_field"])
+    assert not source["adopted"]
+    assert TURNS in source["unexplained"]["description"]
+    assert TURNS not in verdict_of(tmp_path, scenario(seed), None, ["current_field"])["unexplained"]["description"]
+
+
 def test_channels_that_the_base_station_alone_does_not_see_are_named() -> None:
     """A regional gradient along the track, and a channel that has nothing to do with it."""
     rng = np.random.default_rng(33)

@@ -25,7 +25,7 @@ COURSES = 20  # half waves over the survey: what a station does slowly, whatever
 MORE_COURSES = 40  # the same of what is left, of which nobody knows how fast it is
 EACH = 20  # samples at least for each of them
 MOST_CHANNELS = 3
-MOSTLY = 0.5  # of what is left, beside white noise, turns with the platform
+MOSTLY = 0.5  # of what is left, beside white noise, is slow: of the platform or of a station
 
 
 def as_a_station_would(state: State, place: int) -> bool:
@@ -53,16 +53,23 @@ def as_a_station_would(state: State, place: int) -> bool:
 
 def turns_with_the_platform(state: State) -> bool:
     """Whether most of what is left of |b| - F is what a field fixed to the platform would make, whatever its course,
-    and no course of all sensors alike."""
+    rather than courses of all sensors alike; and more of it than chance and the sensors' own slow noise, as they differ
+    by it, would make."""
     residual, x = state.residual, state.excitation
     count = min(MORE_COURSES, len(residual.samples) // EACH)
     if residual.along is None or not count:
         return False
     slow = _half_waves(x, count)[residual.samples]
     fixed, station = _on_the_platform(x, slow), joined([x.on_reference(course, "nT", "") for course in slow.T])
-    given = [] if state.terms is None else [state.terms]
-    turning = _beyond(replace(residual, across=None), WHITE, fixed, [*given, station])[0]
-    return turning > MOSTLY * (float(np.sum(residual.along**2)) - len(residual.along))
+    given, along = [] if state.terms is None else [state.terms], replace(residual, across=None)
+    together = _beyond(along, WHITE, joined([fixed, station]), given)[0]
+    if together <= MOSTLY * (float(np.sum(residual.along**2)) - len(residual.along)):
+        return False
+    turning, steady = (
+        _beyond(along, WHITE, fixed, [*given, station])[0],
+        _beyond(along, WHITE, station, [*given, fixed])[0],
+    )
+    return turning > steady and _beyond(along, state.colours, fixed, [*given, station])[1] <= APART_ALPHA
 
 
 def channels_of_the_total_field(state: State, alpha: float) -> list[str]:

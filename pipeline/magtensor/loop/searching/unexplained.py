@@ -124,11 +124,13 @@ def _what_shows(found: Search, record: Record, excess: float, sparse: SparseRead
     words.extend(changing)
     noise = float(np.hypot(OwnNoise(state.residual, None).slow_along(), of_the_station(state, record)))
     noise = float(np.hypot(noise, sparse.between if sparse is not None else 0.0))
-    if (slow := slow_along(state)) > max(MUCH * state.residual.scale, TWICE * noise):
-        alike = _seen_alike(state.residual)
+    slow, alike = slow_along(state), _seen_alike(state.residual)
+    turning = slow > TWICE * noise and alike and turns_with_the_platform(state)
+    no_station = turning and state.residual.across is not None  # what one sensor wanders by turns as well
+    if slow > TWICE * noise and (no_station or slow > MUCH * state.residual.scale):
         where = "in all sensors alike" if alike else "in their mean"
         cause = ""
-        if alike and turns_with_the_platform(state):
+        if turning:
             cause = ": it turns with the platform, as the field of something on it that no channel logs"
         elif alike:
             cause = ": an error of the base station, or a field that it does not see, of the site or of the platform"
