@@ -37,9 +37,10 @@ from magtensor.loop.evidence.shared_waveform import (
     strongest,
 )
 from magtensor.loop.fitting.log_noise import brought_in
-from magtensor.loop.fitting.model import Adopted, Fitting, Record, State
+from magtensor.loop.fitting.model import Adopted, Fitting, Record, State, generic
 from magtensor.loop.fitting.refit import joint_state
-from magtensor.loop.searching.contribution import happens_once
+from magtensor.loop.fitting.trial import per_sample
+from magtensor.loop.searching.contribution import happens_once, without_models
 from magtensor.loop.searching.gates import OF_THE_LAW, Candidate, explained_before, explained_by, gained_of_a_log
 from magtensor.loop.searching.likeness import (
     effect_along,
@@ -55,6 +56,7 @@ LEVEL_ROUNDS = 3
 MOST_RENEWALS = 10
 SETTLED = 0.1  # of the noise of a sample, along the vectors of a source
 LEAST_NOISE = 0.1  # of what the fit believes
+MOST_OF_A_SAMPLE = 50.0  # log likelihood: half of the largest squared residual of a sample that noise may explain
 IMPROPER = 1 / 3  # of the noise of a sensor's usual axis
 SINGLE_STRETCH = "it acts in a single short stretch, which no other can confirm"
 FEW = 8.0  # independent values: any course with fewer is like some channel, through some power and lag
@@ -228,6 +230,32 @@ def tried_source(
     evidence = Assessment(estimate, folds, gain, gain, None, None, p, p, p, 0.0, state.colours, estimate.theta)
     like = found.like[0] if found.like else followed_by_a_curve(found.time, found.values, record)
     return found, Source(record, after, Candidate(model, 1, terms, evidence, p, p, p, ALPHA), like)
+
+
+def source_instead(
+    component: Component, record: Record, state: State, left: Sought, how: Fitting, fixed: int, alpha: float
+) -> Source | None:
+    """A source nobody logged in the place of the adopted effect that has the same vectors at the sensors: of something
+    that switches now and then a single step is a part, and so is what channels show that feel it late. None where it
+    does not do better.
+
+    Parameters
+    ----------
+    left: what the effect leaves.
+    """
+    places = [i for i, a in enumerate(state.adopted) if a.name == left.left_by and i >= fixed]
+    one_each = [[i] for i in places] if len(places) > 1 else []  # the other may be there
+    found: list[Source] = []
+    for gone in ([places] if places else []) + one_each:
+        less = without_models(record, state, gone, how)
+        tried = left.significant and all(generic(state.adopted[i]) for i in gone)
+        shared = sought(less, record, may_follow=tried)
+        source = None if shared is None else tried_source(component, record, less, shared, how, alpha)[1]
+        if source is not None:
+            lost = max(int(state.fit.keep.sum() - source.after.fit.keep.sum()), 0) / len(state.residual.affine)
+            if per_sample(source.after) > per_sample(state) + MOST_OF_A_SAMPLE * lost:
+                found.append(source)
+    return max(found, key=lambda source: per_sample(source.after), default=None)
 
 
 def _own_noise(state: State) -> Array:

@@ -9,9 +9,9 @@ from functools import cached_property
 from magtensor.components import Component
 from magtensor.error_models.excitation import Excitation
 from magtensor.error_models.needs import missing
-from magtensor.loop.fitting.model import CHANNEL, Fitting, Record, State, generic
+from magtensor.loop.fitting.model import CHANNEL, Fitting, Record, State
 from magtensor.loop.fitting.refit import settled
-from magtensor.loop.fitting.trial import Trial, on_the_folds_of, per_sample, trial
+from magtensor.loop.fitting.trial import Trial, on_the_folds_of, trial
 from magtensor.loop.remainder.curve_of_a_channel import another_curve
 from magtensor.loop.remainder.tones import channels_of_the_line, tones
 from magtensor.loop.searching.any_law import by_a_curve, by_any_law, by_any_law_of
@@ -31,7 +31,7 @@ from magtensor.loop.searching.keeping import (
     why_not,
 )
 from magtensor.loop.searching.larger_law import part_of_a_gradient, part_of_a_larger_law
-from magtensor.loop.searching.latent import NAME, Sought, Source, renewed, sought, tried_source
+from magtensor.loop.searching.latent import NAME, Sought, renewed, sought, source_instead, tried_source
 from magtensor.loop.searching.likeness import followed_by_a_curve, part_of_the_source
 from magtensor.loop.searching.on_fewer_sensors import on_those_needed
 from magtensor.loop.searching.on_more_sensors import in_the_place_of_others, on_more_sensors
@@ -51,10 +51,10 @@ from magtensor.loop.searching.rivals import (
 )
 from magtensor.loop.searching.screening import candidates_of
 from magtensor.loop.searching.split import split
+from magtensor.loop.searching.switched_with import switched_with
 from magtensor.loop.searching.unknown_rate import rate_instead
 from magtensor.loop.searching.which_channel import nearest
 
-MOST_OF_A_SAMPLE = 50.0  # log likelihood: half of the largest squared residual of a sample that noise may explain
 ROUNDING = 1e-4  # mean square of the whitened residual: far below the least noise that any sensor is believed to have
 AS_LASTING = "{}, which lasts, predicts as much"
 
@@ -118,6 +118,10 @@ class Rounds:
         """The models that have what they need and are not in already, or can be in more than once."""
         taken = {a.name for a in state.adopted}
         return [m for m in testable(state.excitation, self.models) if m.name not in taken or repeatable(m)]
+
+    def curves_of(self, channel: str, state: State) -> list[Candidate]:
+        """What follows any curve of a channel, and passes."""
+        return by_any_law_of(channel, state, self.open_models(state), self.alpha)
 
     def run(self, record: Record, state: State, how: Fitting) -> Ended:
         """Adopt the best, refit, repeat, until nothing is left that the data want."""
@@ -223,10 +227,16 @@ class Rounds:
             if why := self.of_another(chosen, before.state):
                 refuse(chosen.model.name, why)
                 continue
+            switched = switched_with(chosen.model, before.state.excitation)
+            if curves := [channel for channel in switched if channel not in asked]:
+                asked.update(curves)
+                left += [c for channel in curves for c in self.curves_of(channel, before.state)]
+                continue
             chosen, channels = nearest(chosen, before.state, models, anything)
-            for frequency in tones_of(chosen.model):
-                if channels := channels_of_the_line(before.state.excitation, frequency):
-                    rivals = tuple(sorted({*rivals, CHANNEL}))
+            x = before.state.excitation
+            of_a_tone = [c for frequency in tones_of(chosen.model) for c in channels_of_the_line(x, frequency)]
+            if same := (*switched, *of_a_tone):
+                channels, rivals = same, tuple(sorted({*rivals, CHANNEL}))
             time = beside_time(chosen, before.state)
             if time.refused:
                 refuse(chosen.model.name, time.refused)
@@ -236,7 +246,7 @@ class Rounds:
                 refuse(chosen.model.name, f"any curve of {channel} explains more")
                 if channel not in asked:
                     asked.add(channel)
-                    left += by_any_law_of(channel, before.state, self.open_models(before.state), self.alpha)
+                    left += self.curves_of(channel, before.state)
                 continue
             alike = as_predictive(chosen, candidates, before.state) | by_a_worse_log(chosen, outdone, before.state)
             in_it = [c for c in candidates if refused.get(c.model.name) == AS_LASTING.format(chosen.model.name)]
@@ -344,7 +354,7 @@ class Rounds:
             return Kept(None)
         channel = followed_by_a_curve(shared.time, shared.values, record)
         state = standing.state
-        curves = by_any_law_of(channel, state, self.open_models(state), self.alpha) if channel else []
+        curves = self.curves_of(channel, state) if channel else []
         return self.first_kept(record, standing, curves, how, models, with_others=False)
 
     def with_source(
@@ -359,7 +369,7 @@ class Rounds:
         instead = None
         if source is None and shared.left_by:
             instead = shared.left_by
-            source = _source_instead(hidden, record, state, shared, how, self.fixed, self.alpha)
+            source = source_instead(hidden, record, state, shared, how, self.fixed, self.alpha)
         if source is None:
             return shared, None
         if self.say is not None:
@@ -380,32 +390,6 @@ def _outdone(chosen: Candidate, state: State) -> str:
     theta = chosen.assessment.theta[-chosen.terms.count :]
     seen = chosen.before or state  # at the samples of its terms
     return another_curve(seen, chosen.model, chosen.terms, theta, chosen.assessment.colours)
-
-
-def _source_instead(
-    component: Component, record: Record, state: State, left: Sought, how: Fitting, fixed: int, alpha: float
-) -> Source | None:
-    """A source nobody logged in the place of the adopted effect that has the same vectors at the sensors: of something
-    that switches now and then a single step is a part, and so is what channels show that feel it late. None where it
-    does not do better.
-
-    Parameters
-    ----------
-    left: what the effect leaves.
-    """
-    places = [i for i, a in enumerate(state.adopted) if a.name == left.left_by and i >= fixed]
-    one_each = [[i] for i in places] if len(places) > 1 else []  # the other may be there
-    found: list[Source] = []
-    for gone in ([places] if places else []) + one_each:
-        less = without_models(record, state, gone, how)
-        tried = left.significant and all(generic(state.adopted[i]) for i in gone)
-        shared = sought(less, record, may_follow=tried)
-        source = None if shared is None else tried_source(component, record, less, shared, how, alpha)[1]
-        if source is not None:
-            lost = max(int(state.fit.keep.sum() - source.after.fit.keep.sum()), 0) / len(state.residual.affine)
-            if per_sample(source.after) > per_sample(state) + MOST_OF_A_SAMPLE * lost:
-                found.append(source)
-    return max(found, key=lambda source: per_sample(source.after), default=None)
 
 
 @dataclass(frozen=True)
