@@ -20,7 +20,7 @@ from magtensor.loop.evidence.colour import colour_of
 from magtensor.loop.fitting.model import Adopted, Fitting
 from magtensor.loop.fitting.refit import joint_state
 from magtensor.loop.fitting.separation import plainer
-from magtensor.loop.searching.course_of_time import FIRST_LEFT
+from magtensor.loop.searching.course_of_time import FIRST_LEFT, responses_like
 from magtensor.loop.searching.kin import explained_by_courses
 from magtensor.registry import Registry
 from magtensor_effects.ageing import courses
@@ -166,3 +166,23 @@ def test_what_an_event_leaves_is_no_smooth_course(adopted: str, course: bool) ->
     response = {"order": 1, "channel": "temperature", "lag_s": 0.0, "delayed": False, "at_start": 0.0}
     found = looked_at(state, Adopted(registry.find("error_model", "temperature_scale"), response))
     assert (explained_by_courses(state, found) > 10.0 * found.assessment.gain.total) == course
+
+
+def test_a_response_that_is_no_more_than_a_course_of_time_is_named_beside_a_drift() -> None:
+    """A thermometer that settles while something drifts; and one that swings meanwhile, which nothing follows."""
+    part = np.linspace(0.0, 1.0, 1200)
+    each = np.random.default_rng(12).standard_normal((4, 3))
+    record = synthetic(12, added=4.0 * (part - 0.2 * part**2)[:, None, None] * each)
+    logged = {"temperature": 8.0 * part, "swing": np.sin(25.0 * part)}
+    record = replace(
+        record, logged=logged, origins=dict.fromkeys(logged, np.zeros(())), units=dict.fromkeys(logged, "degC")
+    )
+    state = joint_state(record, [], Fitting())
+    drift = Registry.load().find("error_model", "offset_drift")
+    channel = Registry.load().find("error_model", "channel_response")
+    named = {name: settings.options[0] for name, settings in profiled(channel).items() if hasattr(settings, "options")}
+    linear = looked_at(state, Adopted(drift, {"order": 1, "span_s": 1199.0}))
+    warmer, swings = (looked_at(state, Adopted(channel, {**named, "channel": name, "lag_s": 0.0})) for name in logged)
+    assert responses_like(linear, [warmer, swings], state) == {"channel_response"}
+    assert responses_like(linear, [swings], state) == set()
+    assert responses_like(swings, [warmer], state) == set()

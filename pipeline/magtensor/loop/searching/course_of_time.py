@@ -152,6 +152,14 @@ def rivals_in_time(candidate: Candidate, possible: Sequence[Candidate], state: S
     return {c.model.name for c in of_time if c is not candidate and overlaps(c, candidate, state)}
 
 
+def responses_like(drift: Candidate, courses: Sequence[Candidate], state: State) -> set[str]:
+    """The models of responses that are refused for smooth courses of time and predict most of what a drift does: it is
+    one of those courses, and nothing tells which of them there is."""
+    if TIME not in drivers(drift.model, state.excitation) or happens_once(drift.model):
+        return set()
+    return {c.model.name for c in courses if overlaps(drift, c, state)}
+
+
 def _followed(model: Adopted, x: Excitation) -> str:
     """What a response follows: its one channel, or the field if it lags that; "" for neither, and for several."""
     channels = model.channels(x)

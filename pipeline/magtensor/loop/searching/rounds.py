@@ -16,7 +16,7 @@ from magtensor.loop.remainder.curve_of_a_channel import another_curve
 from magtensor.loop.remainder.tones import channels_of_the_line, tones
 from magtensor.loop.searching.any_law import by_a_curve, by_any_law, by_any_law_of
 from magtensor.loop.searching.contribution import eliminate, tones_of, without_models
-from magtensor.loop.searching.course_of_time import beside_time, rivals_in_time
+from magtensor.loop.searching.course_of_time import beside_time, responses_like, rivals_in_time
 from magtensor.loop.searching.exchange import exchanged, looked_at_again
 from magtensor.loop.searching.found import Step
 from magtensor.loop.searching.gates import Candidate
@@ -200,6 +200,7 @@ class Rounds:
         refused: dict[str, str] = {}
         asked: set[str] = set()  # channels whose curves have had their turn
         outdone: list[Candidate] = []
+        courses: list[Candidate] = []  # that are no more than smooth courses of time
         anything = next((m for m in self.models if m.name == CHANNEL), None)
         left = list(candidates)
 
@@ -240,6 +241,7 @@ class Rounds:
             time = beside_time(chosen, before.state)
             if time.refused:
                 refuse(chosen.model.name, time.refused)
+                courses.append(chosen)
                 continue
             if channel := _outdone(chosen, before.state):
                 outdone.append(chosen)
@@ -251,6 +253,7 @@ class Rounds:
             alike = as_predictive(chosen, candidates, before.state) | by_a_worse_log(chosen, outdone, before.state)
             in_it = [c for c in candidates if refused.get(c.model.name) == AS_LASTING.format(chosen.model.name)]
             rivals = tuple(sorted({*rivals, *alike, *events_like(chosen, in_it, before.state)}))
+            rivals = tuple(sorted({*rivals, *responses_like(chosen, courses, before.state)}))
             if not time.seen:
                 rivals = tuple(sorted({*rivals, *rivals_in_time(chosen, possible, before.state)}))
             if self.say is not None:
