@@ -19,6 +19,8 @@ from magtensor.error_models.terms import Terms, joined
 from magtensor.tensor.elements import COMPONENTS, NINE_OF_FIVE
 from magtensor.tensor.geometry import field_polynomials, term_names
 
+APART = 3.0  # times the usual mean square between the sensors: a field that differs among them
+LEAST_MEANWHILE = 4  # samples that tell
 MOST_OF_A_DEGREE = 3.0  # rms, over what lower degrees make
 FEW = 500  # attitudes that tell how much that is
 
@@ -119,9 +121,16 @@ def _harmonic(name: str, places: Array) -> Array:
     return out
 
 
-def _or_at_the_station(_: Excitation, settings: Mapping[str, Any], __: Mapping[tuple[str, str], float]) -> str:
-    """Where else it may have passed: a gradient at the rig alone would tell."""
-    return "" if settings.get("whole") else "in |b| - F alone: it may have passed the base station instead"
+def _or_at_the_station(x: Excitation, settings: Mapping[str, Any], _: Mapping[tuple[str, str], float]) -> str:
+    """Where else it may have passed; or what tells that it did not: a gradient at the rig."""
+    if settings.get("whole"):
+        return ""
+    if x.apart is not None:
+        meanwhile = np.abs(x.elapsed - settings["time_s"]) < settings["passage_s"]
+        least = APART * float(np.median(x.apart[~meanwhile])) if (~meanwhile).any() else np.inf
+        if meanwhile.sum() >= LEAST_MEANWHILE and float(np.median(x.apart[meanwhile])) > least:
+            return "the sensors differ meanwhile: it passed these"
+    return "in |b| - F alone: it may have passed the base station instead"
 
 
 @error_model(

@@ -628,3 +628,8 @@ def test_a_passage_that_no_gradient_tells_may_have_been_at_the_base_station() ->
     assert means is not None
     assert "the base station instead" in means(x, {"time_s": 50.0, "passage_s": 5.0, "whole": False}, {})
     assert means(x, {"time_s": 50.0, "passage_s": 5.0, "whole": True}, {}) == ""
+    noise = np.random.default_rng(3).chisquare(9, len(x.time)) / 9.0  # of four sensors, mean squares of nine contrasts
+    near = noise + 4.0 * (np.abs(x.elapsed - 50.0) < 6.0)
+    settings = {"time_s": 50.0, "passage_s": 5.0, "whole": False}
+    assert "the base station instead" in means(replace(x, apart=noise), settings, {})
+    assert means(replace(x, apart=near), settings, {}) == "the sensors differ meanwhile: it passed these"

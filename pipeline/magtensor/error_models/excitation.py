@@ -49,6 +49,8 @@ class Excitation(Acting):
         part_of: what this is a part of, and the numbers of the samples in it; None for a whole survey.
         courses: name of a thermometer -> its log, and its course without the noise of the log; filled as they are
             asked for, so that one is made for all fits of a record.
+        apart: (N,) mean square of what a fit leaves between the sensors, whitened, at samples without a part in it too;
+            known where what a model means is told. None elsewhere, and of a single sensor.
         again: `output` and `field` with as much noise again as they hold; None where that is too little to make any
             difference.
     """
@@ -71,6 +73,7 @@ class Excitation(Acting):
     station: Station | None = None
     part_of: tuple[Excitation, NDArray[np.int_]] | None = None
     courses: dict[str, tuple[Array, Array]] = dataclasses.field(default_factory=dict, compare=False, repr=False)
+    apart: Array | None = None
     again: tuple[Array, Array] | None = dataclasses.field(default=None, compare=False, repr=False)
 
     def at(self, samples: NDArray[np.int_]) -> Excitation:
@@ -88,6 +91,7 @@ class Excitation(Acting):
             attitude=None if self.attitude is None else self.attitude[samples],
             waveform=None if self.waveform is None else self.waveform[samples],
             site=None if self.site is None else self.site[samples],
+            apart=None if self.apart is None else self.apart[samples],
             part_of=(self, samples),
             again=None,
         )

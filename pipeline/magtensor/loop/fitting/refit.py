@@ -328,3 +328,9 @@ def without(record: Record, each: Sequence[Terms], theta: Sequence[Array]) -> tu
         for terms, coefficients in zip(each, theta, strict=True):
             reference = reference - terms.on_reference(coefficients)
     return raw, reference
+
+
+def everywhere(record: Record, state: State) -> Residual:
+    """What a fit leaves at all samples, those that have no part in it as well."""
+    raw, reference = without(record, [a.terms(state.excitation) for a in state.adopted], state.theta)
+    return residual_of(replace(state.fit, keep=np.ones(len(raw), dtype=bool)), raw, reference)

@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
-from magtensor.calibration.types import Mask
+from magtensor.calibration.types import Array, Mask
 from magtensor.error_models.excitation import Excitation
 from magtensor.in_a_row import in_a_row
 from magtensor.loop.evidence.own_noise import OwnNoise
-from magtensor.loop.evidence.residual import residual_of
 from magtensor.loop.fitting.model import Record, State, unread
-from magtensor.loop.fitting.refit import without
+from magtensor.loop.fitting.refit import everywhere
 from magtensor.loop.remainder.sparse_readings import SparseReadings
 
 LONGEST_SPIKE = 2  # samples: what lasts longer is no accident of the recording
 MANY_FLAGGED = 0.01  # of the samples: of what is left, some is in these
 HYSTERESIS = "hysteresis"
 ALIKE = 0.1  # of the mean square along the field, across it: an effect on each sensor shows as much in both
+APART = 3.0  # times the white noise of a sensor: a part in which they are not alike
 AT_AN_END = 0.95  # of the other samples have smaller, or larger, values on average
 ALPHA = 0.001  # of the test whether samples after pauses are bad more often
 FAR = 3.0  # times the rms of slow noise: where it wanders furthest it stays for a while
@@ -97,8 +95,7 @@ def flagged_words(
     """How many samples were taken out of use because nothing explains them, when, how large, on which sensors; and
     whether the slow noise of the sensors goes as far, being no outlier of white noise that it is, or all of them lie
     between readings of a base station that is read too seldom."""
-    raw, reference = without(record, [a.terms(state.excitation) for a in state.adopted], state.theta)
-    every = residual_of(replace(state.fit, keep=np.ones(len(flagged), dtype=bool)), raw, reference)
+    every = everywhere(record, state)
     runs = len(in_a_row(flagged))
     after = record.time[flagged] - record.start
     shared = 0.0 if every.along is None else float(np.mean(every.along[flagged] ** 2))
@@ -110,9 +107,11 @@ def flagged_words(
         usual = OwnNoise(state.residual, None).slow_along()
         alike = every.across is not None and own.max() < ALIKE * shared
         where = " of |b| - F" + (", in all sensors alike" if alike else "")
+        if alike and own.max() > APART:
+            where += f" but for {_nT(own, every.noise)[int(np.argmax(own))]:.2g} nT"
     else:
         worst = int(np.argmax(own))
-        amount = float(np.sqrt(own[worst] * np.mean(every.noise[3 * worst : 3 * worst + 3] ** 2)))
+        amount = float(_nT(own, every.noise)[worst])
         slow = OwnNoise(state.residual, None).slow_std()[3 * worst : 3 * worst + 3]
         usual = float(np.sqrt(np.mean(slow**2)))
         where = f", mostly on {state.excitation.sensors[worst]}"
@@ -127,6 +126,11 @@ def flagged_words(
     if amount > FAR * usual:
         return words, False
     return f"{words}; slow noise, of {usual:.3g} nT rms there, may go as far", True
+
+
+def _nT(own: Array, noise: Array) -> Array:
+    """(S,) nT rms an axis, of mean squares of the sensors (S,) in units of their noise (3 S,)."""
+    return np.asarray(np.sqrt(own * np.mean(noise.reshape(-1, 3) ** 2, axis=1)))
 
 
 def _at_an_end(flagged: Mask, state: State, record: Record) -> str:

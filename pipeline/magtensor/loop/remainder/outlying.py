@@ -6,16 +6,16 @@ of that; no other sensor can make as much of it, unless there are but two.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from magtensor.calibration.joint_together import ABOUT, LEAST_FOR_REJECTION
 from magtensor.calibration.types import Array, Mask
-from magtensor.loop.evidence.residual import Residual, residual_of
+from magtensor.loop.evidence.residual import Residual
 from magtensor.loop.evidence.stretches import NEIGHBOURS
 from magtensor.loop.fitting.model import Record, State, unread
-from magtensor.loop.fitting.refit import without
+from magtensor.loop.fitting.refit import everywhere
 from magtensor.loop.remainder.flagged import ALIKE, LONGEST_SPIKE, MANY_FLAGGED
 
 BEYOND = 5.0  # times the noise of a sensor
@@ -46,9 +46,7 @@ class Outlying:
         """Of the state by which it is told what is left."""
         from scipy.ndimage import median_filter
 
-        raw, reference = without(record, [a.terms(state.excitation) for a in state.adopted], state.theta)
-        every = residual_of(replace(state.fit, keep=np.ones(len(record.time), dtype=bool)), raw, reference)
-        count, names = len(record.time), record.sensors
+        every, count, names = everywhere(record, state), len(record.time), record.sensors
         size = np.zeros(count) if every.along is None else np.abs(every.along / every.reference_gain)
         if every.across is None:
             return cls((), np.zeros((count, 0)), np.zeros((count, 0, 3)), np.zeros((count, 0), dtype=bool), size)

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
+from magtensor.error_models.excitation import Excitation
 from magtensor.error_models.settings import Beginning, Bends, EventTimes, Forms, Frequencies, Range, profiled
 from magtensor.error_models.waveform import NAME
 from magtensor.loop.fitting.model import CHANNEL, Adopted, Record
+from magtensor.loop.fitting.refit import everywhere
 from magtensor.loop.searching.contribution import happens_once
 from magtensor.loop.searching.found import Search, Step, without_and_with
 from magtensor.loop.searching.gates import Candidate
@@ -24,7 +27,7 @@ def described(found: Search, record: Record, declared: int) -> dict[str, Any]:
         declared: how many of the error models were declared and are no discovery.
     """
     return {
-        "adopted": [_adopted(found, i) for i in range(declared, len(found.last.adopted))],
+        "adopted": [_adopted(found, record, i) for i in range(declared, len(found.last.adopted))],
         "rejected": _rejected(found),
         "not_tested": [
             {"error_model": name, "missing": list(missing)} for name, missing in sorted(found.not_tested.items())
@@ -84,7 +87,7 @@ def _step_of(found: Search, model: Adopted) -> Step | None:
     return found.steps[min(fitting)[1]] if fitting else None
 
 
-def _adopted(found: Search, index: int) -> dict[str, Any]:
+def _adopted(found: Search, record: Record, index: int) -> dict[str, Any]:
     state = found.last
     model = state.adopted[index]
     edges = np.cumsum([0, *(len(t) for t in state.theta)])
@@ -100,7 +103,7 @@ def _adopted(found: Search, index: int) -> dict[str, Any]:
     p = float("nan") if step is None or step.adopted is None else step.adopted.assessment.p
     meaning = model.component.means
     found_of = dict(zip(zip(sensors, names, strict=True), map(float, state.theta[index]), strict=True))
-    means = "" if meaning is None else meaning(state.excitation, model.settings, found_of)
+    means = "" if meaning is None else meaning(_with_what_differs(found, record), model.settings, found_of)
     return {
         "error_model": model.name,
         "kind": model.component.effect,
@@ -116,6 +119,16 @@ def _adopted(found: Search, index: int) -> dict[str, Any]:
         **({"means": means} if means else {}),
         **({"most_like_channel": step.like} if step is not None and step.like else {}),
     }
+
+
+def _with_what_differs(found: Search, record: Record) -> Excitation:
+    """What error models see, and how far the sensors differ at every sample."""
+    state = found.last
+    left = everywhere(record, state)
+    if left.across is None:
+        return state.excitation
+    apart = np.sum(left.across**2, axis=1) / max(float(np.trace(left.projector)), 1.0)
+    return replace(state.excitation, apart=apart)
 
 
 def _settings(model: Adopted) -> dict[str, Any]:
