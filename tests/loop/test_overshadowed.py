@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -18,7 +19,7 @@ from magtensor.loop.fitting.refit import joint_state
 from magtensor.loop.searching import overshadowed, rounds, search
 from magtensor.loop.searching.contribution import borne_out
 from magtensor.loop.searching.found import Search
-from magtensor.loop.searching.overshadowed import attitude_share
+from magtensor.loop.searching.overshadowed import attitude_share, of_what_is_left_out
 from magtensor.registry import Registry
 
 MODELS = ("nonlinearity_quadratic", "nonlinearity_cubic", "current_field", "site_gradient")
@@ -244,3 +245,23 @@ def test_what_is_left_after_others_are_taken_out_has_to_serve(
     state, dropped = borne_out(record, joint_state(record, [model], Fitting()), Fitting(), 0)
     assert [a.name for a in state.adopted] == ["temperature_offset"] * kept
     assert dropped == ("temperature_offset",) * (not kept)
+
+
+@pytest.mark.parametrize("along", [True, False])
+def test_a_step_along_whose_vector_more_is_left_out_is_a_part_of_that(along: bool) -> None:
+    """A source that acts by a law of its own, most of it left out: its last switch seems to be a step."""
+    vectors = np.random.default_rng(4).standard_normal((2, 4, 3))
+    after = np.arange(1200) > 1000
+    record = synthetic(14, added=4.0 * after[:, None, None] * vectors[0])
+    found = search.search(record, [Registry.load().find("error_model", "offset_step")], Fitting())
+    assert [a.name for a in found.last.adopted] == ["offset_step"]
+    assert of_what_is_left_out(found, 0) is None
+    out = (np.arange(1200) > 300) & (np.arange(1200) < 600)
+    raw = record.raw + 8.0 * out[:, None, None] * vectors[0 if along else 1]
+    keep = found.last.fit.keep & ~out
+    last = replace(found.last, fit=replace(found.last.fit, keep=keep))
+    left_out = replace(found, record=replace(record, raw=raw), last=last, evenly=None)
+    doubted = of_what_is_left_out(left_out, 0)
+    assert (doubted is not None) is along
+    if doubted is not None:
+        assert doubted[0] == [0] and "299 samples" in doubted[1]

@@ -9,7 +9,7 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
-from loop_cases import Array, linear_state, scenario, synthetic, verdict_of
+from loop_cases import Array, adopted_names, linear_state, scenario, synthetic, verdict_of
 
 from magtensor.loop.fitting.model import Adopted
 from magtensor.loop.searching.switched_with import switched_with
@@ -57,3 +57,24 @@ def test_a_channel_is_one_of_an_event_that_was_switched_at_each_of_its_times(
     x = replace(state.excitation, logged=logged)
     model = Adopted(Registry.load().find("error_model", "offset_while"), times)
     assert switched_with(model, x) == found
+
+
+@pytest.mark.long
+def test_what_acts_from_some_time_on_is_no_event_at_its_last_switch(tmp_path: Path) -> None:
+    """A pump whose leads were laid past the sensors half way: most of what it does is left out as what nothing
+    explains, and its last switch is no step."""
+    at = np.array([60.0, 220.0, 330.0, 450.0, 560.0, 620.0, 640.0, 860.0, 970.0, 1100.0, 1125.0])
+    amperes = np.array([0.0, 2.5, 4.0, 1.0, 2.5, 0.0, 4.0, 4.0, 2.5, 2.5, 0.0, 1.0])
+
+    def laid(path: Path) -> None:
+        with h5py.File(path, "a") as file:
+            time = file["time"][:] - file["time"][0]
+            current = amperes[np.searchsorted(at, time)]
+            vectors = np.random.default_rng(17).standard_normal(file["b_raw"].shape[1:])
+            file["b_raw"][:] = file["b_raw"][:] + 0.4 * (current * (time > 600.0))[:, None, None] * vectors
+            file["current_motor"] = current + 0.01 * np.random.default_rng(18).standard_normal(len(time))
+            file["current_motor"].attrs["units"] = "A"
+
+    told = verdict_of(tmp_path, scenario(43, channels={}), laid, [*MODELS, "current_field", "calibration_step"])
+    assert adopted_names(told) <= {"current_field"}
+    assert told["unexplained"]["present"]

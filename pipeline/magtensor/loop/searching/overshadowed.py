@@ -6,7 +6,8 @@ predicts held-out blocks, and is wrong elsewhere: of the five components of a gr
 quadratic nonlinearity. So an adopted effect that follows the attitude and explains less than what stays unexplained is
 taken out again. So is a tone that may be a harmonic of how the platform turns; and so is what happened once, where more
 of the kind beside it is significant and predicts nothing, as where a sensor wanders, or where the sensors share a
-waveform that has no name and is larger, or switches along the same vectors: a step or a passage may be a part of it;
+waveform that has no name and is larger, or switches along the same vectors: a step or a passage may be a part of it,
+or where nearly all that is left out of the calibration lies along its vector;
 and a source that nobody logged, whose waveform may be a small part of any law that has no name. And whatever is larger,
 an effect with which held-out blocks are predicted worse than without it, once no noise is weighed against another, was
 one of a few samples that the colour of the noise made much of.
@@ -26,6 +27,7 @@ from magtensor.error_models.waveform import NAME
 from magtensor.loop.evidence.assessment import estimated
 from magtensor.loop.evidence.residual import taken_off
 from magtensor.loop.fitting.model import Adopted, State
+from magtensor.loop.fitting.refit import everywhere
 from magtensor.loop.remainder.predictable import (
     MOST_OF_IT,
     attitude_part,
@@ -48,7 +50,7 @@ def overshadowed(found: Search, fixed: int) -> tuple[list[int], str] | None:
     adopted, and why it is doubted."""
     state, left = found.told, staying(found)
     weakest: tuple[float, list[int], str] | None = None
-    if (part := _of_an_adopted_source(state, fixed)) is not None:
+    if (part := _of_an_adopted_source(state, fixed) or of_what_is_left_out(found, fixed)) is not None:
         return part
     for places in _of_one_name(state, fixed):
         before, after = without_and_with(found, *places)
@@ -128,6 +130,32 @@ def _of_an_adopted_source(state: State, fixed: int) -> tuple[list[int], str] | N
         own = _vector(state, place) if place >= fixed and happens_once(model) else None
         if own is not None and _along(own, source):
             return [place], f"it lies along the vectors of {NAME}, of which it is a part"
+    return None
+
+
+def of_what_is_left_out(found: Search, fixed: int) -> tuple[list[int], str] | None:
+    """An offset that came or went, along whose vector nearly all goes that samples without a part in the calibration
+    are off by, and more than it explains: what it is a part of acts at other times too, by a law that has no name."""
+    state = found.told
+    events = [i for i, a in enumerate(state.adopted) if i >= fixed and happens_once(a)]
+    known = [(i, v) for i in events if (v := _vector(state, i)) is not None]
+    out = ~np.asarray(state.fit.keep)
+    left = everywhere(found.record, state) if known and out.any() else None
+    if left is None or left.across is None:
+        return None
+    off = left.across[out]
+    beyond = float(np.sum(off**2) - len(off) * np.trace(left.projector))
+    for place, vector in known:
+        seen = vector / left.noise @ left.projector
+        size = float(np.linalg.norm(seen))
+        along = float(np.sum((off @ seen) ** 2)) / size**2 - len(off) if size > 0.0 else 0.0
+        (series,) = state.adopted[place].terms(state.excitation).series[~out].T
+        if along > ALONG**2 * beyond and along > size**2 * float(np.sum((series - series.mean()) ** 2)):
+            return (
+                [place],
+                f"what {len(off)} samples that fit no calibration are off by lies along its vector, and is more: "
+                "it acts at other times too",
+            )
     return None
 
 

@@ -51,7 +51,7 @@ from magtensor.loop.searching.rivals import (
 )
 from magtensor.loop.searching.screening import candidates_of
 from magtensor.loop.searching.split import split
-from magtensor.loop.searching.switched_with import switched_with
+from magtensor.loop.searching.switched_with import of_no_law, switched_with
 from magtensor.loop.searching.unknown_rate import rate_instead
 from magtensor.loop.searching.which_channel import nearest
 
@@ -232,6 +232,9 @@ class Rounds:
             if curves := [channel for channel in switched if channel not in asked]:
                 asked.update(curves)
                 left += [c for channel in curves for c in self.curves_of(channel, before.state)]
+                continue
+            if why := of_no_law(chosen, switched, [*candidates, *left], before.state):
+                refuse(chosen.model.name, why)
                 continue
             chosen, channels = nearest(chosen, before.state, models, anything)
             x = before.state.excitation

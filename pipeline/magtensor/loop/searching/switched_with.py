@@ -2,18 +2,22 @@
 
 A mode that an instrument is put into, a range, a stage of a heater: what follows it by a law of its own jumps whenever
 it is switched, and every jump looks like an event. By chance the times of an event are hardly those of a channel that
-is switched seldom.
+is switched seldom; where no law of that is known that explains the event, it is none all the same.
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 
 from magtensor.calibration.types import Array
 from magtensor.error_models.excitation import Excitation
 from magtensor.loop.fitting.log_noise import white_noise
-from magtensor.loop.fitting.model import Adopted
+from magtensor.loop.fitting.model import Adopted, State
 from magtensor.loop.searching.contribution import moments
+from magtensor.loop.searching.gates import Candidate
+from magtensor.loop.searching.rivals import overlaps
 
 CHANCE = 0.01  # that the times of an event are those at which any of the channels was switched
 A_SWITCH = 6.0  # standard deviations of the log's noise in a step
@@ -36,6 +40,17 @@ def switched_with(model: Adopted, x: Excitation) -> tuple[str, ...]:
         if all(float(np.min(np.abs(switches - time))) <= beside for time in times):
             found.append(name)
     return tuple(found)
+
+
+def of_no_law(event: Candidate, channels: Sequence[str], candidates: Sequence[Candidate], state: State) -> str:
+    """Why an event is not adopted at whose times channels were switched: no candidate that follows one of them predicts
+    most of what it does, so that it is what a channel does by a law that has no name; "" where one does, or there are
+    no such channels."""
+    follows = [c for c in candidates if c.model.channels(state.excitation) & set(channels)]
+    if not channels or any(overlaps(event, c, state) for c in follows):
+        return ""
+    names = " and ".join(channels)
+    return f"{names} was switched at each of its times, by no law of which it is explained"
 
 
 def _switches(values: Array, x: Excitation) -> Array:
