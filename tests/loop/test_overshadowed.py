@@ -265,3 +265,16 @@ def test_a_step_along_whose_vector_more_is_left_out_is_a_part_of_that(along: boo
     assert (doubted is not None) is along
     if doubted is not None:
         assert doubted[0] == [0] and "299 samples" in doubted[1]
+
+
+@pytest.mark.parametrize(("phases", "told"), [(1, False), (3, True)])
+def test_what_comes_and_goes_along_one_vector_is_one_source(phases: int, told: bool) -> None:
+    """Though offsets for a while explain all of it: one of them may be a tool that lay there, three are a source."""
+    vectors = np.random.default_rng(6).standard_normal((4, 3))
+    edges = np.array([150, 330, 480, 620, 800, 1010])[: 2 * phases]
+    on = np.searchsorted(edges, np.arange(1200), side="right") % 2
+    record = synthetic(15, added=4.0 * on[:, None, None] * vectors)
+    found = search.search(record, [Registry.load().find("error_model", "offset_while")], Fitting())
+    assert [a.name for a in found.last.adopted] == ([] if told else ["offset_while"])
+    whys = [why for step in found.steps for why in step.refused.values()]
+    assert any("switches along one vector" in why for why in whys) is told

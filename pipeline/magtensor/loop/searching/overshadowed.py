@@ -41,6 +41,7 @@ from magtensor.loop.searching.unexplained import unexplained
 
 WORSE = 1.01  # times the held-out rms without an effect, all noise alike: noise of a colour does not make up for that
 NAMELESS = 2.0  # times what stays, that a response to a logged vector explains if it is the law
+LONE = 2  # events along one vector may be all that happened, where nothing stays
 ALONG = 0.95  # cosine, with a source's vector or another event's; of one sensor 5 % of all directions are as near
 HARMONICS = 16  # of the turning, that a law of the attitude with a corner shows
 
@@ -68,6 +69,8 @@ def overshadowed(found: Search, fixed: int) -> tuple[list[int], str] | None:
         if why := why or _of_what_wanders(found, state, places):
             weakest = amount, places, why
     several = _of_one_that_switches(state, fixed)
+    if several is not None and len(several[0]) > LONE:
+        return several
     present = (weakest or several) is not None and bool(unexplained(found, found.record)["present"])
     if weakest is None or not present:
         return _part_of_a_source(found, fixed) or (several if present else None)
@@ -160,7 +163,7 @@ def of_what_is_left_out(found: Search, fixed: int) -> tuple[list[int], str] | No
 
 
 def _of_one_that_switches(state: State, fixed: int) -> tuple[list[int], str] | None:
-    """Several offsets that came or went along one vector: something switches, and more often than they tell."""
+    """Several offsets that came or went along one vector: something switches, perhaps more often than they tell."""
     events = [(i, _vector(state, i)) for i, a in enumerate(state.adopted) if i >= fixed and happens_once(a)]
     known = [(i, v) for i, v in events if v is not None]
     for _, first in known:
