@@ -4,16 +4,20 @@ neither the calibration nor the search."""
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
-from loop_cases import Array, scenario, survey_file
+from loop_cases import Array, scenario, survey_file, synthetic
 
 import magtensor
 from magtensor.errors import DataError
 from magtensor.loop.evidence.stretches import louder_in
+from magtensor.loop.fitting.model import Fitting
+from magtensor.loop.searching.search import search
+from magtensor.registry import Registry
 
 SEARCHED = ["offset_while", "offset_step", "temperature_offset"]
 
@@ -79,3 +83,16 @@ def test_what_is_wrong_throughout_is_not_said_to_lack_attitudes(tmp_path: Path) 
     with pytest.raises(DataError, match="y axis of sensor 3 is inverted") as refused:
         magtensor.close_loop(path, search=SEARCHED)
     assert "attitudes" not in str(refused.value) and "nominal" not in str(refused.value)
+
+
+def test_what_a_wrong_sensor_spoils_elsewhere_is_no_noise() -> None:
+    """With its samples in the fit what is left grows as the platform turns, in all sensors, as if these were loud."""
+    record = synthetic(3, samples=2400, noise_nT=0.2, turning_s=60.0)
+    raw, wrong = np.array(record.raw), slice(500, 620)
+    raw[wrong, 2] = x_negated(raw[wrong, 2])
+    record, registry = replace(record, raw=raw), Registry.load()
+    models = [registry.find("error_model", name) for name in ("offset_while", "latent_source")]
+    found = search(record, models, Fitting())
+    assert [a.name for a in found.last.adopted] == []
+    assert not found.last.fit.keep[wrong].any() and found.last.fit.keep.sum() == 2280
+    assert found.shared is None or not found.shared.significant

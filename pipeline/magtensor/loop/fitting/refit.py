@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from magtensor.calibration import joint
 from magtensor.calibration.coverage import Coverage
 from magtensor.calibration.joint import JointFit, fit_recording
+from magtensor.calibration.joint_together import MOSTLY
 from magtensor.calibration.nominal import fit_nominal
 from magtensor.calibration.recording import InMemory
 from magtensor.calibration.types import Array
@@ -263,7 +264,8 @@ def rounding(record: Record, state: State) -> float:
 
 
 def loud_stretches(record: Record, state: State, how: Fitting) -> tuple[tuple[float, float], ...]:
-    """s, from when to when the noise is so loud that the calibration is better without these samples."""
+    """s, from when to when the noise is so loud that the calibration is better without these samples. A stretch of
+    which a fit doubts most is wrong, and not loud."""
     if rounding(record, state):
         return ()  # outputs that are repeated tell no noise
     each = [a.terms(state.excitation) for a in state.adopted]
@@ -274,7 +276,8 @@ def loud_stretches(record: Record, state: State, how: Fitting) -> tuple[tuple[fl
     ]
     loud = too_loud(state.fit, raw, reference, effects, how.reference_noise)
     edges = np.flatnonzero(np.diff(loud.astype(int), prepend=0, append=0)).reshape(-1, 2)
-    return tuple((float(record.time[first]), float(record.time[end - 1])) for first, end in edges)
+    believed = [(first, end) for first, end in edges if np.mean(state.fit.keep[first:end]) >= 1.0 - MOSTLY]
+    return tuple((float(record.time[first]), float(record.time[end - 1])) for first, end in believed)
 
 
 def disturbed(record: Record, state: State, how: Fitting) -> NDArray[np.bool_]:

@@ -26,7 +26,7 @@ from magtensor.loop.remainder.flagged import lasting
 from magtensor.loop.searching.contribution import borne_out, eliminate, over_at_once, without_models
 from magtensor.loop.searching.found import Search, Step
 from magtensor.loop.searching.gates import ALPHA
-from magtensor.loop.searching.latent import NAME, SINGLE_STRETCH, renewed, sought
+from magtensor.loop.searching.latent import NAME, renewed, sought
 from magtensor.loop.searching.on_fewer_sensors import on_those_that_show
 from magtensor.loop.searching.on_more_sensors import in_the_place_of_others
 from magtensor.loop.searching.overshadowed import overshadowed
@@ -88,11 +88,10 @@ def search(
         shown, steps = standing.state, _with_dropped(steps, gone)
     last = ended.settled if shown is state else settled(record, shown, how)
     over = any(over_at_once(last, place) for place in range(len(declared), len(last.adopted)))
-    if over or (state.fit.keep & ~last.fit.keep).any():  # what only these samples asked for goes with them
+    fewer = bool((state.fit.keep & ~last.fit.keep).any())
+    if over or fewer:  # what only these samples asked for goes with them
         last, steps = _weighed_once_more(record, last, steps, how, len(declared))
-    shared = ended.shared
-    if shared is None or shared.objection == SINGLE_STRETCH:  # it may be flagged now
-        shared = sought(last, record)
+    shared = sought(last, record) if ended.shared is None or fewer else ended.shared
     evenly = unweighed(record, last, how)
     not_tested = _not_tested(last.excitation, models)
     found = Search(first, last, steps, not_tested, rounds.failed, record, shared, how, evenly)
@@ -125,7 +124,7 @@ def _without_what_is_loud(ended: Ended, rounds: Rounds) -> Ended:
     better off alone; as it ended where there are none, or where what was adopted is shown there only."""
     if ended.how.nominal is not None:
         return ended
-    loud = loud_stretches(ended.record, ended.state, ended.how)
+    loud = loud_stretches(ended.record, ended.settled, ended.how)  # what nothing explains spoils what is left elsewhere
     if not loud:
         return ended
     how = replace(ended.how, without=loud)
