@@ -159,3 +159,20 @@ def test_channels_with_its_line_are_named_beside_a_tone(tmp_path: Path) -> None:
     told = verdict_of(tmp_path, scenario(75), logged, ["periodic_interference"])
     (adopted,) = told["adopted"]
     assert adopted["indistinguishable_from"] == ["channel_response"] and adopted["channels_as_good"] == ["vibration"]
+
+@pytest.mark.parametrize("seed", [51, pytest.param(52, marks=pytest.mark.long)])
+def test_a_tone_of_few_periods_is_found(seed: int, tmp_path: Path) -> None:
+    """A thermostat that nobody logged, or mains that the sampling folds down, fourteen periods in all."""
+    rng, frequency = np.random.default_rng(seed), 14.3 / 1200.0
+
+    def sways(path: Path) -> None:
+        with h5py.File(path, "a") as file:
+            turns = 2.0 * np.pi * frequency * (file["time"][:] - file["time"][0])
+            phase, size = rng.uniform(0.0, 2.0 * np.pi, (2, *file["b_raw"].shape[1:]))
+            file["b_raw"][:] = file["b_raw"][:] + 0.15 * size * np.sin(turns[:, None, None] + phase)
+
+    told = verdict_of(tmp_path, scenario(seed), sways, ["periodic_interference", "latent_source", "offset_while"])
+    (tone,) = told["adopted"]
+    assert tone["error_model"] == "periodic_interference"
+    assert tone["settings"]["frequency_Hz"] == pytest.approx(frequency, abs=0.1 / 1200.0)
+    assert not told["unexplained"]["present"], told["unexplained"]["description"]

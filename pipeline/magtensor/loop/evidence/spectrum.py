@@ -16,6 +16,7 @@ _ON_THE_GRID = 0.1  # of a step, that an interval may be off it
 _SPREAD = 10  # places of the fine grid to either side that a sample is spread over: to 1e-9
 _OF_A_MEDIAN = 2.0 / np.pi  # of what a mean of as many values tells
 _LEAST_SAMPLES = 256
+_LEAST_PERIODS = 10  # in a survey, of a slow line: one in each held-out fold
 _BESIDE = 3.0  # frequencies, a survey's length apart, that are one line
 _LEAST_TURNED = 1e-2  # of the largest mean square of the direction's components, from which on one is known
 _LEAST_VARIANCE = 1e-6  # of the largest, of the noise of a coordinate
@@ -78,8 +79,9 @@ def spectral_lines(residual: Residual, time: Array, most: int = 5) -> list[tuple
     and of what is left of |b| - F as a field fixed to the platform makes it.
 
     p is that of the largest of all peaks under noise without lines. The lowest frequencies, where no smooth spectrum
-    can be told from a line, are left out; so are surveys that lack more than a quarter of their samples. Those that are
-    missing from an even grid are interpolated; where the times lie on none, each sample counts at its own.
+    can be told from a line, are left out: of what differs between the sensors those of less than ten periods. So are
+    surveys that lack more than a quarter of their samples. Those that are missing from an even grid are interpolated;
+    where the times lie on none, each sample counts at its own.
     """
     if len(time) < _LEAST_SAMPLES:
         return []
@@ -105,7 +107,7 @@ def _between(residual: Residual, grid: _Grid, most: int) -> list[_Line]:
         coordinates, size = colour.whiten(coordinates) * np.sqrt(colour.white), grid.left_by(colour)
     spectrum = grid.spectrum(coordinates)
     square = 2.0 * np.sum(np.abs(spectrum) ** 2, axis=1) / coordinates.shape[1]
-    return _largest(spectrum, coordinates, np.sqrt(square) / grid.n * residual.scale / size, grid, most)
+    return _largest(spectrum, coordinates, np.sqrt(square) / grid.n * residual.scale / size, grid, most, slow=True)
 
 
 def _on_the_platform(residual: Residual, grid: _Grid, most: int) -> list[_Line]:
@@ -126,27 +128,33 @@ def _on_the_platform(residual: Residual, grid: _Grid, most: int) -> list[_Line]:
 
 
 def _largest(
-    spectrum: NDArray[np.complex128], coordinates: Array, rms_nT: Array, grid: _Grid, most: int
+    spectrum: NDArray[np.complex128], coordinates: Array, rms_nT: Array, grid: _Grid, most: int, *, slow: bool = False
 ) -> list[_Line]:
-    """The strongest peaks of a spectrum (M, K) of coordinates (N, K) over its running median."""
+    """The strongest peaks of a spectrum (M, K) of coordinates (N, K) over its running median; among them, if asked for,
+    slow ones, judged by as few frequencies beside them as there are, and as if the coordinates shared one series: what
+    is slow may be one effect."""
     from scipy.special import chdtri, fdtrc
 
     k = coordinates.shape[1]
     power = np.sum(np.abs(spectrum @ _alike(coordinates)) ** 2, axis=1) / grid.n
     width = max(len(power) // 100, 15)
-    smooth = _running_median(power, width)
+    smooth, lowest = _running_median(power, width), min(2 * width, len(power))
     ratio = power / np.maximum(smooth, 1e-300) * chdtri(2 * k, 0.5) / 2.0  # to the scale of k exponentials' sum
-    ratio[: 2 * width] = 0.0
-    known_from = 2 * k * _OF_A_MEDIAN * (2 * width + 1)
+    p = fdtrc(2 * k, 2 * k * _OF_A_MEDIAN * (2 * width + 1), ratio / k)
+    first = min(_LEAST_PERIODS, lowest) if slow else lowest
+    p[:first] = 1.0
+    for i in range(first, lowest):
+        beside = i // 2
+        over = power[i] / max(float(np.median(power[i - beside : i + beside + 1])), 1e-300) * np.log(2.0)
+        p[i] = fdtrc(2, 2 * _OF_A_MEDIAN * (2 * beside + 1), over)
     frequency = grid.frequency
     lines: list[_Line] = []
-    for i in np.argsort(-ratio):
+    for i in np.lexsort((-ratio, p)):
         if len(lines) == most:
             break
         if any(abs(frequency[i] - other.frequency_Hz) < _BESIDE / (grid.n * grid.step) for other in lines):
             continue
-        p = float(fdtrc(2 * k, known_from, ratio[i] / k)) * len(power)
-        lines.append(_Line(float(frequency[i]), float(rms_nT[i]), p))
+        lines.append(_Line(float(frequency[i]), float(rms_nT[i]), float(p[i]) * len(power)))
     return lines
 
 
