@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from loop_cases import BASE, adopted_names, lasting_effects, linear_state, scenario, synthetic, verdict_of
+from loop_cases import BASE, adopted_names, lasting_effects, linear_state, looked_at, scenario, synthetic, verdict_of
 
 from magtensor.error_models.terms import Terms
 from magtensor.loop.fitting.model import Adopted, Fitting, Record, State
@@ -273,3 +273,24 @@ def test_what_gives_way_is_told_whether_it_explained_less(
 
     monkeypatch.setattr(outcome, "happens_once", lambda _: False)
     assert outcome.why(candidate("tone", gain), candidate("drift", 100.0)).startswith(words)
+
+
+@pytest.mark.parametrize("seed", [1, 8])
+def test_a_mount_that_slipped_is_no_part_of_what_a_current_bends(seed: int) -> None:
+    """Of a current seen through a lag longer than the survey, whose log's noise might explain what it is behind by if
+    that were not seen in what it leaves, which is far louder."""
+    plain, rng = synthetic(seed, 2400, noise_nT=0.2, turning_s=6.0), np.random.default_rng(seed)
+    amperes = np.array([2.5, 4.0, 1.0, 2.5, 4.0, 0.0, 4.0, 0.0, 4.0, 2.5, 0.0, 1.0])
+    on = amperes[np.searchsorted(np.sort(rng.uniform(0.0, 2400.0, 11)), plain.time)]
+    raw = plain.raw.copy()
+    raw[1320:, 1] += 7e-4 * np.cross(plain.raw[1320:, 1], [0.3, -0.8, 0.5])
+    logged = {"current_motor": on - on.mean() + 0.03 * rng.standard_normal(2400)}
+    record = replace(
+        plain, raw=raw, logged=logged, origins={"current_motor": np.zeros(())}, units={"current_motor": "A"}
+    )
+    state, registry = linear_state(record), Registry.load()
+    bends = {"channel": "current_motor", "lag_s": 1800.0, "smooth": False, "angles": 3}
+    slipped = looked_at(state, Adopted(registry.find("error_model", "turn_step"), {"time_s": 1319.5, "angles": 3}))
+    bent = looked_at(state, Adopted(registry.find("error_model", "channel_alignment"), bends))
+    assert slipped.assessment.gain.total > 100.0 * bent.assessment.gain.total
+    assert rivals.part_of_a_drift(slipped, [slipped, bent], state) is None

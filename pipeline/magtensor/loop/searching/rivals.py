@@ -154,7 +154,7 @@ def part_of_a_drift(candidate: Candidate, candidates: Sequence[Candidate], state
         if not gain.consistent and other.adjusted_null_p >= other.alpha:
             continue
         whole, own, both = _beside(candidate, other, state)
-        if own > whole and not worse_log(candidate, other, own - whole, state):
+        if own > whole and not worse_log(candidate, other, _ahead(candidate, other, state), state):
             continue
         if both - whole < SMALL_PART * own:
             return _judged_by_its_part(other, candidate, state)
@@ -187,6 +187,14 @@ def _beside(candidate: Candidate, other: Candidate, state: State) -> tuple[float
     colours, parts = other.assessment.colours, candidate.assessment.parts
     whole, own, both = (fold_gain(state, colours, *terms, parts=parts).total for terms in each)
     return whole, own, both
+
+
+def _ahead(candidate: Candidate, other: Candidate, state: State) -> float:
+    """By how much a candidate predicts more than another model, in noise of the colour that the candidate leaves: what
+    the other leaves may be far louder, and then the candidate seems hardly ahead."""
+    colours, parts = candidate.assessment.colours, candidate.assessment.parts
+    own, its = (fold_gain(state, colours, terms, parts=parts).total for terms in (candidate.terms, other.terms))
+    return own - its
 
 
 def begun(candidate: Candidate) -> int:
