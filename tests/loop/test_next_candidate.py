@@ -140,6 +140,7 @@ def test_what_another_width_of_an_adopted_law_explains_is_no_other_effect(
     monkeypatch.setattr(rounds, "containing", lambda best, *_: best)
     monkeypatch.setattr(rounds, "simplest", unchanged)
     monkeypatch.setattr(rounds, "nearest", unchanged)
+    monkeypatch.setattr(rounds, "switched_with", lambda *_: ())
     monkeypatch.setattr(rounds, "_outdone", lambda *_: "")
     monkeypatch.setattr(rounds, "rate_instead", lambda *_: "")
     monkeypatch.setattr(rounds, "hindered_by_another", lambda *_: None)
@@ -180,6 +181,7 @@ def test_of_one_name_the_curve_of_another_channel_is_still_tried(monkeypatch: py
         "containing": lambda best, *_: best,
         "simplest": unchanged,
         "nearest": unchanged,
+        "switched_with": lambda *_: (),
         "part_of_a_larger_law": lambda *_: "",
         "part_of_a_gradient": lambda *_: "",
         "part_of_a_drift": lambda *_: None,

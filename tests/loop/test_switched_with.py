@@ -56,7 +56,7 @@ def test_a_channel_is_one_of_an_event_that_was_switched_at_each_of_its_times(
     logged = {"stage": stage + 0.01 * noise[0], "supply": 12.0 + 0.1 * noise[1]}
     x = replace(state.excitation, logged=logged)
     model = Adopted(Registry.load().find("error_model", "offset_while"), times)
-    assert switched_with(model, x) == found
+    assert switched_with(model, replace(state, excitation=x)) == found
 
 
 @pytest.mark.long

@@ -155,7 +155,7 @@ def rivals_in_time(candidate: Candidate, possible: Sequence[Candidate], state: S
 def responses_like(drift: Candidate, courses: Sequence[Candidate], state: State) -> set[str]:
     """The models of responses that are refused for smooth courses of time and predict most of what a drift does: it is
     one of those courses, and nothing tells which of them there is."""
-    if TIME not in drivers(drift.model, state.excitation) or happens_once(drift.model):
+    if not courses or TIME not in drivers(drift.model, state.excitation) or happens_once(drift.model):
         return set()
     return {c.model.name for c in courses if overlaps(drift, c, state)}
 

@@ -228,7 +228,7 @@ class Rounds:
             if why := self.of_another(chosen, before.state):
                 refuse(chosen.model.name, why)
                 continue
-            switched = switched_with(chosen.model, before.state.excitation)
+            switched = switched_with(chosen.model, before.state)
             if curves := [channel for channel in switched if channel not in asked]:
                 asked.update(curves)
                 left += [c for channel in curves for c in self.curves_of(channel, before.state)]
@@ -237,8 +237,8 @@ class Rounds:
                 refuse(chosen.model.name, why)
                 continue
             chosen, channels = nearest(chosen, before.state, models, anything)
-            x = before.state.excitation
-            of_a_tone = [c for frequency in tones_of(chosen.model) for c in channels_of_the_line(x, frequency)]
+            frequencies = tones_of(chosen.model)
+            of_a_tone = [c for f in frequencies for c in channels_of_the_line(before.state.excitation, f)]
             if same := (*switched, *of_a_tone):
                 channels, rivals = same, tuple(sorted({*rivals, CHANNEL}))
             time = beside_time(chosen, before.state)

@@ -24,9 +24,9 @@ A_SWITCH = 6.0  # standard deviations of the log's noise in a step
 BESIDE = 1.5  # samples between the time of an event and that of a switch
 
 
-def switched_with(model: Adopted, x: Excitation) -> tuple[str, ...]:
+def switched_with(model: Adopted, state: State) -> tuple[str, ...]:
     """The logged channels that were switched at every time of an event; none of a model that is of no event."""
-    times = moments(model)
+    times, x = moments(model), state.excitation
     single = {name: values for name, values in x.logged.items() if values.ndim == 1}
     if not times or not single:
         return ()
@@ -46,8 +46,10 @@ def of_no_law(event: Candidate, channels: Sequence[str], candidates: Sequence[Ca
     """Why an event is not adopted at whose times channels were switched: no candidate that follows one of them predicts
     most of what it does, so that it is what a channel does by a law that has no name; "" where one does, or there are
     no such channels."""
+    if not channels:
+        return ""
     follows = [c for c in candidates if c.model.channels(state.excitation) & set(channels)]
-    if not channels or any(overlaps(event, c, state) for c in follows):
+    if any(overlaps(event, c, state) for c in follows):
         return ""
     names = " and ".join(channels)
     return f"{names} was switched at each of its times, by no law of which it is explained"
