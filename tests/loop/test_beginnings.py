@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import h5py
 import numpy as np
 import pytest
-from loop_cases import BASE, lasting_effects, linear_state, loaded, scenario, survey_file, verdict_of
+from loop_cases import BASE, lasting_effects, linear_state, loaded, scenario, survey_file, synthetic, verdict_of
 
 from magtensor import close_loop
+from magtensor.calibration.types import ArrayCalibration
 from magtensor.error_models.example import example_survey
+from magtensor.loop.correcting.another_survey import as_begun_here
+from magtensor.loop.fitting.model import Adopted
 from magtensor.loop.searching.beginnings import at_its_limit
 from magtensor.registry import Registry
 
@@ -182,3 +186,35 @@ def test_what_is_taken_to_begin_in_equilibrium_is_told(sensors: int, tmp_path: P
     done = close_loop(survey_file(tmp_path, first), search=["temperature_offset"])
     there = done.calibration.apply(survey_file(tmp_path, second, "second.h5"))["calibrated/b"].attrs
     assert there.get("in_equilibrium") == (None if sensors == 4 else "temperature_offset")
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_beginning_that_another_survey_hardly_shows_is_no_impossible_field(seed: int) -> None:
+    """Iron that does nearly the same to all sensors along one axis: what it came from there is known from so little
+    that noise would make ten times the Earth's field of it."""
+    rng = np.random.default_rng(seed)
+    plain, tau = synthetic(seed, noise_nT=0.2, turning_s=20.0), 15.0
+    place = 0.25 * np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, -1.0, 0.0]])
+    matrices = 30e-6 * rng.standard_normal((4, 3, 3))
+    matrices[:, :, 0] = 30e-6 * (rng.standard_normal(3) + 0.003 * rng.standard_normal((4, 3)))
+    came_from = rng.normal(0.0, 30e3, 3)
+    forward = np.eye(3) + 0.01 * rng.standard_normal((4, 3, 3))
+    field = plain.raw.mean(axis=1)
+    lagging, keep = np.empty_like(field), np.exp(-1.0 / tau)
+    lagging[0] = field[0] + came_from
+    for k in range(1, len(field)):  # the field goes straight from one sample to the next
+        slope = field[k] - field[k - 1]
+        lagging[k] = field[k] - slope * tau + (lagging[k - 1] - field[k - 1] + slope * tau) * keep
+    seen = np.einsum("sij,nsj->nsi", forward, field[:, None] + np.einsum("sij,nj->nsi", matrices, lagging - field))
+    record = replace(plain, raw=seen + 0.2 * rng.standard_normal(seen.shape), position=place)
+    calibration = ArrayCalibration(np.linalg.inv(forward), np.zeros((4, 3)), np.zeros((48, 48)), "sensor S1")
+    names = [f"at_start_{axis}_nT" for axis in "xyz"]
+    model = Adopted(
+        Registry.load().find("error_model", "viscous_magnetisation"), {"tau_s": tau, **dict.fromkeys(names, np.nan)}
+    )
+    added = np.einsum("sij,sjk->sik", forward, matrices)  # the model's matrices act on the outputs
+    ((found, _),) = as_begun_here(record, calibration, [(model, 1e6 * added.ravel())])
+    began = np.array([found.settings[name] for name in names])
+    print(began, came_from)
+    assert np.linalg.norm(began[1:] - came_from[1:]) < 8e3
+    assert abs(began[0] - came_from[0]) < 50e3

@@ -164,7 +164,8 @@ def _state_here(
     """What the lagged response of one of the effects was out of equilibrium by when the survey began: settings.
 
     It dies away with the lag, along vectors that are known: a number, or the components of a vector, found by least
-    squares beside a constant, and 0 where slow noise could be it. With fewer than four sensors, or positions that are
+    squares beside a constant, and 0 where slow noise could be it. A vector is no larger than fields there are: noise
+    would make far more of a component that is nearly the same to all sensors. With fewer than four sensors, or positions that are
     not known, nothing tells it from a field that changes, and it is taken for 0.
     """
     from scipy.special import chdtrc, chdtri
@@ -183,6 +184,12 @@ def _state_here(
     left, courses = left - left.mean(axis=0), courses - courses.mean(axis=0)
     state = np.linalg.lstsq(courses.reshape(-1, len(names)), left.ravel(), rcond=1e-6)[0]
     course = courses @ state
+    if len(names) == 3:  # a vector: what was magnetised in the Earth's field differs from it by one as large
+        size = float(np.median(np.linalg.norm(here.excitation.field, axis=2)))
+        held = float(np.var(left - course)) / size**2
+        normal = np.einsum("nki,nkj->ij", courses, courses) + held * np.eye(3)
+        state = np.linalg.solve(normal, np.einsum("nki,nk->i", courses, left))
+        course = courses @ state
     grid = next(g for n, g in profiled(model.component).items() if n == names[0])
     parts = max(int(np.ptp(record.time) / float(model.settings[grid.lag])), LEAST_PARTS)
     least = float(chdtri(len(names), chdtrc(1, SIGNIFICANT**2)))
