@@ -217,4 +217,4 @@ def test_a_beginning_that_another_survey_hardly_shows_is_no_impossible_field(see
     began = np.array([found.settings[name] for name in names])
     print(began, came_from)
     assert np.linalg.norm(began[1:] - came_from[1:]) < 8e3
-    assert abs(began[0] - came_from[0]) < 50e3
+    assert abs(began[0] - came_from[0]) < 100e3  # twice the field

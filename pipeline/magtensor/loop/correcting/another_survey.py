@@ -165,8 +165,8 @@ def _state_here(
 
     It dies away with the lag, along vectors that are known: a number, or the components of a vector, found by least
     squares beside a constant, and 0 where slow noise could be it. A vector is no larger than fields there are: noise
-    would make far more of a component that is nearly the same to all sensors. With fewer than four sensors, or positions that are
-    not known, nothing tells it from a field that changes, and it is taken for 0.
+    would make far more of a component that is nearly the same to all sensors. With fewer than four sensors, or
+    positions that are not known, nothing tells it from a field that changes, and it is taken for 0.
     """
     from scipy.special import chdtrc, chdtri
 
