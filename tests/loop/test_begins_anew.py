@@ -120,6 +120,7 @@ def test_a_slip_goes_on_where_the_outputs_show_it(tmp_path: Path, found: Found, 
     there = survey_file(tmp_path, of_a_day(6, *([SLIP | {"time_s": 0.0}] if again else []), start=LATER), "there.h5")
     b = done.calibration.apply(there)["calibrated/b"]
     assert b.attrs.get("not_as_dated", "") == ("lag_step (happened before)" if again else "")
+    assert "held" not in b.attrs
     apart = b[:, 1] - b[:, [0, 2, 3]].mean(axis=1)
     assert np.sqrt(np.mean(apart**2)) < 0.25  # of noise 0.17 nT; the slip makes some 150 nT
 

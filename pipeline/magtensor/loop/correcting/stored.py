@@ -140,11 +140,14 @@ def not_as_dated(adopted: Sequence[Adopted], survey: Survey) -> str:
 
 
 def held(adopted: Sequence[Adopted], survey: Survey) -> str:
-    """Which effects stay as they were when what is known of them ended, and for how long; "" where none does."""
+    """Which effects stay as they were when what is known of them ended, and for how long; "" where none does. What
+    happened at a time is over then, as a recorder's slip is."""
     words = []
     for a in adopted:
-        known = [float(a.settings[n]) for n, mark in profiled(a.component).items() if isinstance(mark, Duration)]
-        if a.start is None or not known or abs(late := a.start - float(survey.time[0])) >= LONG:
+        marks = profiled(a.component)
+        known = [float(a.settings[n]) for n, mark in marks.items() if isinstance(mark, Duration)]
+        over = any(isinstance(mark, EventTimes) for mark in marks.values())
+        if a.start is None or not known or over or abs(late := a.start - float(survey.time[0])) >= LONG:
             continue
         beyond = float(survey.time[-1] - survey.time[0]) - late - max(known)
         if beyond > LONG_PART * max(known):
