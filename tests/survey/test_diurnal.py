@@ -217,3 +217,12 @@ def test_the_reference_s_noise_is_carried() -> None:
 def test_resolution_is_the_least_uncertainty() -> None:
     record = np.round(48_000 + np.arange(500) * 0.001, 1)
     assert noise(record) >= 0.1 / np.sqrt(12)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_spike_near_larger_ones_is_one(seed: int) -> None:
+    """Near an end, where each of them counts twice, two make a quiet record seem active around them."""
+    places = np.array([15, 27, 35, 300])
+    values = 49_000.0 + 0.1 * np.random.default_rng(seed).standard_normal(420) + np.sin(np.arange(420) / 40.0)
+    values[places] += [7.9, 20.0, 20.0, 7.9]
+    assert np.flatnonzero(spikes(values, 8.0)).tolist() == places.tolist()

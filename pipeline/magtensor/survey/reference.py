@@ -17,6 +17,7 @@ ENDS = 4  # samples whose line a record goes on along: of two it would be mostly
 SPIKE_WINDOW = 7  # samples; three good neighbours on each side outvote a spike of up to three samples
 SPIKE_ALONE = 0.7  # of its deviation from the cubic: both are the spike's height, and half a step's from the cubic
 LEFT_BESIDE = 0.25  # of its deviation from the cubic: a lone spike leaves nothing at its neighbours, a step a third
+SPIKE_ROUNDS = 4  # in which spikes are looked for, the ones found taken out
 SPIKE_SURROUNDINGS = 61  # samples that tell what is usual where the field is active
 
 
@@ -84,15 +85,28 @@ def spikes(values: Floats, threshold: float) -> Bools:
     The cubic tells a spike from a pulsation; the neighbours and the median tell it from a step, and the neighbours do
     so where the record is steep. Each deviation's scale is 1.4826 times its median magnitude over the whole record, or
     what the upper quartile of the magnitudes around the sample would be the scale of, if that is larger; and at least
-    the record's resolution: a proton magnetometer that rounds to 0.1 nT repeats itself for long.
+    the record's resolution: a proton magnetometer that rounds to 0.1 nT repeats itself for long. Where spikes are
+    found it is asked once more without them, for a few of them make a quiet record seem active around them.
 
     Args:
         values: (N,) finite.
         threshold: standard deviations.
     """
+    least, place = resolution(values), np.arange(len(values))
+    found = np.zeros(len(values), dtype=bool)
+    for _ in range(SPIKE_ROUNDS):
+        without = np.interp(place, place[~found], values[~found]) if found.any() else values
+        more = _spikes_among(without, threshold, least) & ~found
+        if not more.any() or (found | more).all():
+            break
+        found |= more
+    return found
+
+
+def _spikes_among(values: Floats, threshold: float, least: float) -> Bools:
+    """(N,) those that stand out as they are, `least` being the record's resolution."""
     from scipy.ndimage import correlate1d, median_filter
 
-    least = resolution(values)
     strays = correlate1d(values, np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / 6.0, mode="nearest")
     rough = np.abs(strays)
     astray = rough > threshold * _scale(rough, least)
