@@ -16,7 +16,7 @@ from scipy.signal import lfilter
 
 from magtensor.loop.fitting.model import Adopted, Fitting
 from magtensor.loop.fitting.refit import joint_state
-from magtensor.loop.searching import overshadowed, rounds, search
+from magtensor.loop.searching import latent, overshadowed, rounds, search
 from magtensor.loop.searching.contribution import borne_out
 from magtensor.loop.searching.found import Search
 from magtensor.loop.searching.overshadowed import attitude_share, of_what_is_left_out
@@ -186,13 +186,13 @@ def test_a_source_in_the_place_of_a_step_may_cost_samples_that_do_not_make_it_be
         )
 
     before, source = state(1000), SimpleNamespace(after=state(1000 - lost))
-    monkeypatch.setattr(rounds, "without_models", lambda *_: state(1000))
-    monkeypatch.setattr(rounds, "sought", lambda *_, **__: object())
-    monkeypatch.setattr(rounds, "tried_source", lambda *_: (None, source))
-    monkeypatch.setattr(rounds, "per_sample", lambda s: better if s is source.after else 0.0)
+    monkeypatch.setattr(latent, "without_models", lambda *_: state(1000))
+    monkeypatch.setattr(latent, "sought", lambda *_, **__: object())
+    monkeypatch.setattr(latent, "tried_source", lambda *_: (None, source))
+    monkeypatch.setattr(latent, "per_sample", lambda s: better if s is source.after else 0.0)
     left: Any = SimpleNamespace(left_by="offset_while", significant=False)
     given: Any = None
-    found = rounds._source_instead(given, given, before, left, given, 0, 0.005)
+    found = latent.source_instead(given, given, before, left, given, 0, 0.005)
     assert (found is not None) == kept
 
 
@@ -212,13 +212,13 @@ def test_of_two_of_a_kind_one_may_have_taken_the_source_and_the_other_not(monkey
     def tried(_: Any, record: Any, of: Any, *__: Any) -> tuple[None, Any]:
         return None, SimpleNamespace(after=of) if [a.lag for a in of.adopted] != [] else None
 
-    monkeypatch.setattr(rounds, "without_models", without)
-    monkeypatch.setattr(rounds, "sought", lambda *_, **__: object())
-    monkeypatch.setattr(rounds, "tried_source", tried)
-    monkeypatch.setattr(rounds, "per_sample", lambda s: {(40.0,): 3.0, (-180.0,): 1.0}.get(_lags(s), 2.0))
+    monkeypatch.setattr(latent, "without_models", without)
+    monkeypatch.setattr(latent, "sought", lambda *_, **__: object())
+    monkeypatch.setattr(latent, "tried_source", tried)
+    monkeypatch.setattr(latent, "per_sample", lambda s: {(40.0,): 3.0, (-180.0,): 1.0}.get(_lags(s), 2.0))
     left: Any = SimpleNamespace(left_by="temperature_offset", significant=False)
     given: Any = None
-    found = rounds._source_instead(given, given, state(-180.0, 40.0), left, given, 0, 0.005)
+    found = latent.source_instead(given, given, state(-180.0, 40.0), left, given, 0, 0.005)
     assert found is not None and _lags(found.after) == (40.0,)
 
 
