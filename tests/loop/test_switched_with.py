@@ -12,6 +12,7 @@ import pytest
 from loop_cases import Array, adopted_names, linear_state, scenario, synthetic, verdict_of
 
 from magtensor.loop.fitting.model import Adopted
+from magtensor.loop.remainder.flagged import between_switches
 from magtensor.loop.searching.switched_with import switched_with
 from magtensor.registry import Registry
 
@@ -57,6 +58,16 @@ def test_a_channel_is_one_of_an_event_that_was_switched_at_each_of_its_times(
     x = replace(state.excitation, logged=logged)
     model = Adopted(Registry.load().find("error_model", "offset_while"), times)
     assert switched_with(model, replace(state, excitation=x)) == found
+
+
+@pytest.mark.parametrize(("first", "end", "named"), [(301, 701, True), (301, 650, False), (0, 0, False)])
+def test_flagged_samples_between_two_switchings_name_the_channel(first: int, end: int, named: bool) -> None:
+    record = synthetic(5)
+    state, time = linear_state(record), record.time
+    pump = np.interp(time, [300.0, 301.0, 700.0, 701.0], [0.0, 2.0, 2.0, 0.0])
+    flagged = (np.arange(len(time)) >= first) & (np.arange(len(time)) < end)
+    words = between_switches(flagged, replace(state, excitation=replace(state.excitation, logged={"pump": pump})))
+    assert words == (", and begin and end with switchings of pump" if named else "")
 
 
 @pytest.mark.long

@@ -11,6 +11,7 @@ from magtensor.loop.evidence.own_noise import OwnNoise
 from magtensor.loop.fitting.model import Record, State, unread
 from magtensor.loop.fitting.refit import everywhere
 from magtensor.loop.remainder.sparse_readings import SparseReadings
+from magtensor.loop.remainder.switches import switched_at
 
 LONGEST_SPIKE = 2  # samples: what lasts longer is no accident of the recording
 MANY_FLAGGED = 0.01  # of the samples: of what is left, some is in these
@@ -119,13 +120,21 @@ def flagged_words(
     words = (
         f"{int(flagged.sum())} samples in {stretches} ({after[0]:.4g} to {after[-1]:.4g} s after the start) fit no "
         f"calibration, by {amount:.3g} nT rms{where}: they are flagged and have no part in the calibration"
-        f"{_at_an_end(flagged, state, record)}"
+        f"{_at_an_end(flagged, state, record)}{between_switches(flagged, state)}"
     )
     if sparse is not None and alike and sparse.between_readings(flagged, record):
         return f"{words}; they lie between two readings of the base station", True
     if amount > FAR * usual:
         return words, False
     return f"{words}; slow noise, of {usual:.3g} nT rms there, may go as far", True
+
+
+def between_switches(flagged: Mask, state: State) -> str:
+    """In words, the channels that were switched when stretches of flagged samples begin and end."""
+    elapsed = state.excitation.elapsed
+    inside = [i for i in in_a_row(flagged).ravel() if 0 < i < len(elapsed)]
+    names = switched_at([float(elapsed[i - 1] + elapsed[i]) / 2.0 for i in inside], state.excitation)
+    return f", and begin and end with switchings of {' and '.join(names)}" if names else ""
 
 
 def _nT(own: Array, noise: Array) -> Array:
