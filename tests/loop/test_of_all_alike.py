@@ -84,7 +84,7 @@ def test_a_field_of_the_platform_turns_and_an_error_of_the_station_does_not(of_t
 TURNS = "turns with the platform"
 
 
-@pytest.mark.parametrize("seed", [71, 72])
+@pytest.mark.parametrize("seed", [71, pytest.param(72, marks=pytest.mark.long)])
 def test_a_weak_source_on_the_platform_that_nobody_logged_is_told(seed: int, tmp_path: Path) -> None:
     """One vector in all sensors, less than three times their noise of |b| - F: no base station could be so."""
     rng = np.random.default_rng(seed)
