@@ -23,7 +23,8 @@ def magnetised(path: Path) -> None:
         del file["truth"]
 
 
-@pytest.mark.parametrize("seed", [92, pytest.param(93, marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("seed", [92, 93])
 def test_iron_that_is_magnetised_is_not_slow_iron(seed: int, tmp_path: Path) -> None:
     motion = {"type": "tumbling", "duration_s": 150.0, "rate_rms_deg_s": 25.0, "rate_time_s": 3.0}
     survey = scenario(seed, motion=motion, rate_Hz=10.0, truth=True)

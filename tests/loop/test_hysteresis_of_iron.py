@@ -11,9 +11,8 @@ from loop_cases import scenario, verdict_of
 MEMORY = ["hysteresis", "viscous_magnetisation", "eddy_current", "latent_source", "cross_field", "sampling_lag"]
 
 
-@pytest.mark.parametrize(
-    ("kind", "of_iron"), [("iron_hysteresis", True), pytest.param("hysteresis", False, marks=pytest.mark.long)]
-)
+@pytest.mark.long
+@pytest.mark.parametrize(("kind", "of_iron"), [("iron_hysteresis", True), ("hysteresis", False)])
 def test_play_of_iron_and_of_an_axis_are_told_apart(tmp_path: Path, kind: str, of_iron: bool) -> None:
     """Beside the play of each axis, that of the other two would leave room for slow iron: it was adopted as well."""
     effect = {"type": kind, "rms_nT": 0.6, "half_width_nT": [8000.0]}

@@ -267,7 +267,7 @@ def test_a_step_along_whose_vector_more_is_left_out_is_a_part_of_that(along: boo
         assert doubted[0] == [0] and "299 samples" in doubted[1]
 
 
-@pytest.mark.parametrize(("phases", "told"), [(1, False), (3, True)])
+@pytest.mark.parametrize(("phases", "told"), [(1, False), pytest.param(3, True, marks=pytest.mark.long)])
 def test_what_comes_and_goes_along_one_vector_is_one_source(phases: int, told: bool) -> None:
     """Though offsets for a while explain all of it: one of them may be a tool that lay there, three are a source."""
     vectors = np.random.default_rng(6).standard_normal((4, 3))

@@ -32,6 +32,7 @@ def test_a_level_that_comes_and_goes_is_one_effect(motion: dict[str, Any] | None
     assert not told["unexplained"]["present"]
 
 
+@pytest.mark.long
 def test_a_tool_on_the_platform_is_none_of_the_station(tmp_path: Path) -> None:
     there = {"type": "offset_step", "nT": [0.8, -0.6, 0.7], "time_s": [FROM_S]}
     gone = {"type": "offset_step", "nT": [-0.8, 0.6, -0.7], "time_s": [UNTIL_S]}

@@ -30,7 +30,8 @@ def test_a_delay_where_the_rate_is_not_known_is_told(effect: str, tmp_path: Path
     assert any("for which the field turns too fast between samples, explains more" in refused[n] for n in REMEMBERS)
 
 
-@pytest.mark.parametrize("seed", [4, pytest.param(5, marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("seed", [4, 5])
 def test_what_remembers_the_field_is_found_all_the_same(seed: int, tmp_path: Path) -> None:
     survey = scenario(seed, {"type": "hysteresis", "rms_nT": 1.5}, motion=QUICK)
     assert adopted_names(verdict_of(tmp_path, survey, models=[*REMEMBERS, *OF_THE_RATE])) == {"hysteresis"}
