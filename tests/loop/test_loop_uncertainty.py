@@ -42,11 +42,15 @@ def test_errors_of_the_coefficients_go_with_the_calibration(tmp_path: Path) -> N
     for (model, sensor, name), value in told.items():
         assert std[":".join(p for p in (model, sensor, name) if p)] == value
 
+    current = next(a for a in found.verdict["adopted"] if a["error_model"] == "current_field")
+    per_ampere = np.array([c["value"] for c in current["coefficients"]]).reshape(4, 3)
+
     # a site is left behind with the place: another survey need not log what it follows
     second = survey_file(tmp_path, scenario(6, effects[0], **changes), "other.h5")
     with h5py.File(second, "r+") as file:
         del file["attitude"]
         file["current_heater"][:] = file["current_heater"][:] + 100.0
+        file["b_raw"][:] = file["b_raw"][:] + 100.0 * per_ampere  # or its own lengths would refute the effect
     planned = found.computed.planned
     with_errors, without = (
         apply_to(given, second, planned).values("calibrated/tensor_std")
