@@ -255,8 +255,8 @@ class Rounds:
                 continue
             alike = as_predictive(chosen, candidates, before.state) | by_a_worse_log(chosen, outdone, before.state)
             in_it = [c for c in candidates if refused.get(c.model.name) == AS_LASTING.format(chosen.model.name)]
-            rivals = tuple(sorted({*rivals, *alike, *events_like(chosen, in_it, before.state)}))
-            rivals = tuple(sorted({*rivals, *responses_like(chosen, courses, before.state)}))
+            alike |= events_like(chosen, in_it, before.state) | responses_like(chosen, courses, before.state)
+            rivals = tuple(sorted({*rivals, *alike}))
             if not time.seen:
                 rivals = tuple(sorted({*rivals, *rivals_in_time(chosen, possible, before.state)}))
             if self.say is not None:
