@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 from loop_cases import linear_state, synthetic
 
+from magtensor.loop.evidence.even_rate import EvenRate
 from magtensor.loop.fitting.model import Fitting
 from magtensor.loop.searching.latent import sought, tried_source
+from magtensor.loop.searching.profiling import thinned
 from magtensor.registry import Registry
 
 PRIME = 5987  # samples
@@ -34,6 +36,25 @@ def test_a_source_is_known_at_the_samples_that_the_search_leaves_out() -> None:
     assert abs(np.corrcoef(found[last], waveform[last])[0, 1]) > 0.9
     entire = source.after.unabridged
     assert entire.terms is not None and len(entire.terms.series) == source.after.fit.keep.sum()
+
+
+def test_the_part_that_is_screened_is_none_of_an_awkward_length() -> None:
+    """Of 5980 samples every third makes 1994, twice a prime."""
+    few, _ = thinned(linear_state(synthetic(8, samples=5980)), 2000)
+    samples = few.samples
+    assert 0.98 * 1994 < len(samples) < 1994
+    assert max(_factors(len(samples))) <= 23
+    assert len(set(np.diff(samples))) == 1
+
+
+def test_nor_is_a_series_with_its_gaps_filled() -> None:
+    time = np.delete(np.arange(PRIME + 1.0), 100)  # of 5988 places, 12 times a prime
+    even = EvenRate.of(time)
+    assert even is not None
+    filled = even(time)
+    assert 0.98 * PRIME < len(filled) < PRIME
+    assert max(_factors(len(filled))) <= 23
+    np.testing.assert_allclose(filled, np.arange(len(filled)))
 
 
 def _factors(number: int) -> list[int]:

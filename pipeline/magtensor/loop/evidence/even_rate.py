@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from magtensor.calibration.types import Array
+from magtensor.loop.evidence.quick_length import quick_length
 from magtensor.loop.evidence.sensor_noise import LEAST
 
 MOST_MISSING = 0.25  # of the samples: longer gaps are shortened to that
@@ -41,6 +42,7 @@ class EvenRate:
             return None
         missing = np.floor(missing * min(1.0, MOST_MISSING * len(time) / missing.sum())).astype(int)
         before = np.repeat(np.arange(len(time)), np.append(missing, 0) + 1)
+        before = before[: quick_length(len(before))]
         first = np.flatnonzero(np.diff(before, prepend=-1))  # the places of the samples
         number = np.arange(len(before)) - first[before]
         gap = np.append(missing, 0)[before]

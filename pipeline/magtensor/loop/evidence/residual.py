@@ -21,10 +21,9 @@ from magtensor.calibration.joint import JointFit
 from magtensor.calibration.nominal_steps import least
 from magtensor.calibration.types import Array
 from magtensor.error_models.terms import Terms
+from magtensor.loop.evidence.quick_length import quick_length
 from magtensor.loop.evidence.turned import SlowModes
 
-LONG = 1000  # samples, from which on a transform of an awkward length takes long
-LARGEST_FACTOR = 23  # of a length that is not awkward
 NOTHING_BETWEEN = (
     1e-4  # mean square of what is left between sensors: none has so little noise, and rounding says nothing
 )
@@ -224,21 +223,9 @@ def residual_of(fit: JointFit, raw: Array, total_field: Array | None, reference_
 
 
 def quick(residual: Residual) -> Residual:
-    """The residual without the last of its samples (0.1 % of them in the mean, 1.3 % at most) if they are many: a
-    cosine transform of a length that has a large prime factor takes two to five times as long."""
-    count = len(residual.samples)
-    length = count
-    while length > LONG and _rough(length) > 1:
-        length -= 1
-    return residual if length == count else residual.smaller(np.arange(length))
-
-
-def _rough(number: int) -> int:
-    """What is left of a number without its factors up to `LARGEST_FACTOR`."""
-    for factor in range(2, LARGEST_FACTOR + 1):
-        while number % factor == 0:
-            number //= factor
-    return number
+    """The residual without the last of its samples, as few of them as make its transforms quick (`quick_length`)."""
+    length = quick_length(len(residual.samples))
+    return residual if length == len(residual.samples) else residual.smaller(np.arange(length))
 
 
 def _direction(field: Array) -> Array:

@@ -18,6 +18,7 @@ from magtensor.errors import UsageError
 from magtensor.loop.evidence.assessment import WHITE, colours_of
 from magtensor.loop.evidence.columns import Made
 from magtensor.loop.evidence.multiplicity import alike, effective_tests, projected
+from magtensor.loop.evidence.quick_length import quick_length
 from magtensor.loop.evidence.residual import Residual
 from magtensor.loop.evidence.scoring import Scorer
 from magtensor.loop.fitting.model import Adopted, State, regressors
@@ -143,6 +144,7 @@ def thinned(state: State, most: int) -> tuple[Residual, Terms | None]:
     if count <= most:
         return state.residual, state.terms
     thin = np.arange(0, count, -(-count // most))
+    thin = thin[: quick_length(len(thin))]
     return state.residual.smaller(thin), None if state.terms is None else state.terms.at(thin)
 
 
@@ -175,14 +177,14 @@ def best_settings(
     grid = [g for g in settings_grid(model, state.excitation) if not already(state.adopted, model, g)]
     if len(grid) == 1:
         return [Proposed(grid[0], 1.0)]
-    long = len(grid)
     every = [*grid, *short_parts(model, grid, state.excitation)]
     scores, chain = _scores(model, every, few, failed)
     if not scores:
         return []
     times = sum(isinstance(g, EventTimes) for g in profiled(model).values())
     tried = effective_tests(chain, alpha) * BETWEEN_TIMES**times
-    lasting, short = ([s for s in scores if any(s[2] is g for g in some)] for some in (every[:long], every[long:]))
+    of_the_grid = {id(settings) for settings in grid}
+    lasting, short = ([s for s in scores if (id(s[2]) in of_the_grid) is inside] for inside in (True, False))
     found = [Proposed(settings, tried) for settings in _best(lasting)]
     if short:
         found.append(Proposed(max(short, key=lambda s: s[1])[2], tried, "short"))
