@@ -70,7 +70,7 @@ def close_loop(
     from magtensor.calibration.nominal import Nominal
     from magtensor.effect_errors import coefficient_variables, with_coefficients
     from magtensor.loop.correcting.correction import as_elsewhere
-    from magtensor.loop.correcting.stored import LATE, cleaned, effect_variables
+    from magtensor.loop.correcting.stored import SHIFTED, cleaned, effect_variables
     from magtensor.loop.decisions import Decision, decision_of
     from magtensor.loop.evidence.own_noise import OwnNoise
     from magtensor.loop.fitting import refit
@@ -152,12 +152,12 @@ def close_loop(
         doubted = np.zeros(len(survey.time), dtype=bool)
         doubted[record.samples[refit.disturbed(record, last, how)]] = True
         doubted = survey.made_from(doubted)
-        late = unread(last.adopted, survey.time)
-        bad = (doubted | late)[:, None]
+        shifted = unread(last.adopted, survey.time)
+        bad = (doubted | shifted)[:, None]
         given["good"] = (("time", "sensor"), survey.good_by_sensor & ~bad, {"long_name": "may be used"})
         given["flags"] = [
             *flag_ranges(survey.time, doubted, by="close_loop", reason="no calibration and no noise explain it"),
-            *flag_ranges(survey.time, late, by="close_loop", reason=LATE),
+            *flag_ranges(survey.time, shifted, by="close_loop", reason=SHIFTED),
         ]
     return given
 

@@ -13,6 +13,7 @@ from loop_cases import RECIPE, lasting_effects, scenario, survey_file, suspects,
 from magtensor.applying import apply_and_refine
 from magtensor.error_models.first_order import ahead, undone
 from magtensor.error_models.settings import Range
+from magtensor.loop.remainder.flagged import LONGEST_SPIKE
 from magtensor.preparing import empty_survey
 from magtensor.recipe.plan import read_plan
 from magtensor.runner import run
@@ -142,11 +143,15 @@ def test_a_delay_is_told_from_a_time_constant(name: str, channel: str, samples: 
     survey = scenario(33, {"type": name, "channel": channel, "rms_nT": 3.0})
     wind = {"type": "smooth", "mean": 5.0, "rms": 1.0, "time_s": 40.0, "units": "m/s", "log_noise": 0.002}
     survey["channels"] = survey["channels"] | {"wind": wind}
-    told = verdict_of(tmp_path, survey, make_early(channel, samples), ["current_field", "channel_response"])
+    searched = ["current_field", "channel_response", "latent_source", "offset_step"]
+    told = verdict_of(tmp_path, survey, make_early(channel, samples), searched)
     assert [a["error_model"] for a in told["adopted"]] == [name], suspects(told)
     settings = told["adopted"][0]["settings"]
-    assert settings["delayed"]  # before the log begins nothing is known of what it does then
+    assert settings["delayed"]
     assert settings["lag_s"] == pytest.approx(0.5 * samples, rel=0.02)
+    # before the log begins nothing is known of what it does then
+    words = f"{name} acts {settings['lag_s']:.4g} s after what it follows was logged: the first"
+    assert (words in told["unexplained"]["description"]) is (samples > LONGEST_SPIKE)
     assert told["adopted"][0]["evidence"]["held_out_rms_after_nT"] < 1.1 * told["noise_floor_nT"]
 
 

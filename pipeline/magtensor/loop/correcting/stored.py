@@ -28,7 +28,7 @@ from magtensor.survey.flags import flag_ranges
 from magtensor.survey.model import Survey, Variable
 from magtensor.survey.times import split_since
 
-LATE = "the log of what an effect follows is late"
+SHIFTED = "the log of what an effect follows is late or early"
 MISSES = 10.0  # times as long as between its readings: then a channel is missing
 LONG_PART = 0.01  # of a survey, at least
 
@@ -335,14 +335,14 @@ def cleaned(
 
 
 def without_unread(survey: Survey, adopted: Sequence[Adopted]) -> Survey:
-    """The survey with the samples at its end taken out of use of which a log that an effect follows, being late, tells
-    nothing."""
-    late = unread(adopted, survey.time)
-    if not late.any():
+    """The survey with the samples at its ends taken out of use of which a log that an effect follows, being late or
+    early as a whole, tells nothing."""
+    shifted = unread(adopted, survey.time)
+    if not shifted.any():
         return survey
-    good = survey.good_by_sensor & ~late[:, None]
+    good = survey.good_by_sensor & ~shifted[:, None]
     given: dict[str, Variable] = {"good": (("time", "sensor"), good, {"long_name": "may be used"})}
-    return survey.merged(given, flag_ranges(survey.time, late, by="apply", reason=LATE))
+    return survey.merged(given, flag_ranges(survey.time, shifted, by="apply", reason=SHIFTED))
 
 
 def _lacking(effect: Adopted, record: Record) -> str:

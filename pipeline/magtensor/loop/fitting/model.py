@@ -188,11 +188,13 @@ class Adopted:
         return {mark.pick(x, str(self.settings.get(name, ""))) for name, mark in marks if isinstance(mark, AnyChannel)}
 
     @property
-    def late_s(self) -> float:
-        """s by which the log that it follows is late as a whole: of as much at the end of a survey it tells nothing."""
+    def shifted_s(self) -> float:
+        """s by which it acts after what it follows was logged, as a whole, or before, if negative: of as much at the
+        beginning or at the end of a survey the log tells nothing."""
         lag, grid = float(self.settings.get("lag_s", 0.0)), profiled(self.component).get("lag_s")
-        late = isinstance(grid, Range) and grid.spacing == "log" and (grid.late or self.settings.get("delayed", False))
-        return -lag if late and lag < 0 else 0.0
+        if not isinstance(grid, Range) or grid.spacing != "log":
+            return 0.0
+        return lag if self.settings.get("delayed", False) or (grid.late and lag < 0) else 0.0
 
     def terms(self, x: Excitation) -> Terms:
         """Its regressors on a survey, those of other sensors left out."""
@@ -218,12 +220,14 @@ def as_declared(chosen: Iterable[tuple[Component, Mapping[str, Any]]], time: Arr
 def unread(adopted: Sequence[Adopted], time: Array, station: Station | None = None) -> NDArray[np.bool_]:
     """(N,) samples at whose times (N,) s nothing is known of what an adopted model follows.
 
-    A channel had not been read yet, its log being late: the model goes on as well as it can. Or the stamps of a base
-    station are late or early, and the field is not known at them as they are or as they should be.
+    A channel had not been read yet, its log being late, or what was read before the log begins still acts: the model
+    goes on as well as it can. Or the stamps of a base station are late or early, and the field is not known at them as
+    they are or as they should be.
     """
-    late = max((model.late_s for model in adopted), default=0.0)
-    out = time + late > time[-1] if late else np.zeros(len(time), dtype=bool)
+    out = np.zeros(len(time), dtype=bool)
     for model in adopted:
+        if shift := model.shifted_s:
+            out |= (time - shift < time[0]) | (time - shift > time[-1])
         lag = float(model.settings.get("lag_s", 0.0)) if model.component.effect == "reference" else 0.0
         if station is not None and lag:
             out |= ~(station.known(time) & station.known(time + lag))

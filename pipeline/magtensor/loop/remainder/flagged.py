@@ -74,14 +74,22 @@ def unread_words(state: State, record: Record) -> list[str]:
     """How many samples were taken out of use because a log is late or the base station's stamps are wrong, which hardly
     matters for a spike's length."""
     words = []
-    late = unread(state.adopted, record.time)
-    if late.sum() > LONGEST_SPIKE:
-        model = max(state.adopted, key=lambda model: model.late_s)
+    shifted = unread(state.adopted, record.time)
+    middle = len(shifted) // 2
+    late, early = int(shifted[middle:].sum()), int(shifted[:middle].sum())
+    if late > LONGEST_SPIKE:
+        model = min(state.adopted, key=lambda model: model.shifted_s)
         words.append(
-            f"the log that {model.name} follows is {model.late_s:.4g} s late: the last {int(late.sum())} samples, of "
+            f"the log that {model.name} follows is {-model.shifted_s:.4g} s late: the last {late} samples, of "
             "which it tells nothing, are flagged and have no part in the calibration"
         )
-    alone = unread(state.adopted, record.time, record.station) & ~late
+    if early > LONGEST_SPIKE:
+        model = max(state.adopted, key=lambda model: model.shifted_s)
+        words.append(
+            f"{model.name} acts {model.shifted_s:.4g} s after what it follows was logged: the first {early} samples, "
+            "of which the log tells nothing, are flagged and have no part in the calibration"
+        )
+    alone = unread(state.adopted, record.time, record.station) & ~shifted
     if alone.sum() > LONGEST_SPIKE:
         words.append(
             f"the base station, its stamps corrected, has no reading at {int(alone.sum())} samples: they are flagged "
