@@ -77,6 +77,19 @@ def test_a_law_that_is_no_power_is_found_and_nothing_beside_it(law: str) -> None
     assert last.residual.square() < 1.1
 
 
+@pytest.mark.parametrize("seed", [3, 4])
+def test_what_acts_on_one_sensor_where_a_channel_is_low(seed: int) -> None:
+    """It is saturated most of the time, so that a line that explains where it acts predicts elsewhere what is not."""
+    values = np.abs(4.0 + 2.5 * course(seed, remembers_s=20.0))
+    record = logged(seed, values, np.zeros(SAMPLES), rain=course(seed + 20))
+    outputs = record.raw.copy()
+    outputs[:, 0] += np.multiply.outer(np.exp(-values / 0.5), [9.0, -7.0, 5.0])
+    last = found(replace(record, raw=outputs), "channel_response", "offset_while").last
+    assert [(a.name, a.settings["channel"]) for a in last.adopted] == [("channel_response", "valve")]
+    assert last.adopted[0].settings["bends"]
+    assert last.residual.square() < 1.1
+
+
 @pytest.mark.long
 def test_a_dead_zone_ends_where_it_does() -> None:
     """A bend at each of its edges."""

@@ -165,6 +165,12 @@ class Candidate:
         return gain.consistent and gain.total > MUCH * float(gain.before.sum())
 
     @property
+    def unlike_its_law(self) -> bool:
+        """Whether noise does not explain it and yet it does not predict: the law may be another one, as where what
+        follows a channel has an end to it, and acts in a part of the survey only."""
+        return self._more_than_known and not self.passes and self.beyond_own_noise
+
+    @property
     def _more_than_known(self) -> bool:
         """Whether neither what is adopted nor the log's noise explains it, and it is large enough to matter."""
         if self.of_the_log or self.of_second_order or self.of_the_law or self.of_no_shape or self.of_no_blocks:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -208,6 +208,13 @@ class Rounds:
             refused[name] = why
             left[:] = [c for c in left if c.model.name != name]
 
+        def ask(channels: Iterable[str]) -> bool:
+            """Whether there are curves that had not had their turn."""
+            new = sorted(set(channels) - asked)
+            asked.update(new)
+            left.extend(c for channel in new for c in self.curves_of(channel, before.state))
+            return bool(new)
+
         while True:
             passing = [c for c in left if c.passes]
             best = max(passing, key=lambda c: c.assessment.gain.total, default=None)
@@ -216,6 +223,9 @@ class Rounds:
                 if two := self.kept_with_another(record, before, hindered, candidates, how, models):
                     return replace(two, refused=refused)
             if best is None:
+                unlike = [c for c in left if c.unlike_its_law]
+                if ask({name for c in unlike for name in c.model.channels(before.state.excitation)}):
+                    continue
                 break
             possible = [c for c in left if c.predicts]
             best = containing(best, possible, before.state)
@@ -229,9 +239,7 @@ class Rounds:
                 refuse(chosen.model.name, why)
                 continue
             switched = switched_with(chosen.model, before.state)
-            if curves := [channel for channel in switched if channel not in asked]:
-                asked.update(curves)
-                left += [c for channel in curves for c in self.curves_of(channel, before.state)]
+            if ask(switched):
                 continue
             if why := of_no_law(chosen, switched, [*candidates, *left], before.state):
                 refuse(chosen.model.name, why)
@@ -249,9 +257,7 @@ class Rounds:
             if channel := _outdone(chosen, before.state):
                 outdone.append(chosen)
                 refuse(chosen.model.name, f"any curve of {channel} explains more")
-                if channel not in asked:
-                    asked.add(channel)
-                    left += self.curves_of(channel, before.state)
+                ask([channel])
                 continue
             alike = as_predictive(chosen, candidates, before.state) | by_a_worse_log(chosen, outdone, before.state)
             in_it = [c for c in candidates if refused.get(c.model.name) == AS_LASTING.format(chosen.model.name)]
