@@ -146,6 +146,19 @@ def test_a_switch_is_known_exactly_and_a_wave_is_no_switch() -> None:
     assert two_levels(noise, 0.2, noise) is None
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_where_every_output_wanders_none_of_them_switches(seed: int) -> None:
+    """Each jumps anew sixty times: in such noise any course is near one of two levels. A switch in white noise is."""
+    rng = np.random.default_rng(seed)
+    held = np.vstack([np.eye(3)] * 4)
+    jumps = np.repeat(np.cumsum(rng.standard_normal((60, 12)), axis=0), 50, axis=0)
+    direction = np.linalg.svd(jumps - jumps.mean(axis=0), full_matrices=False)[2][0]
+    assert not course_of(jumps + rng.standard_normal((3000, 12)), held, direction).switches
+    on = np.cumsum(rng.uniform(size=3000) < 0.02) % 2.0
+    alone = np.multiply.outer(8.0 * on, direction) + rng.standard_normal((3000, 12))
+    assert course_of(alone, held, direction).switches
+
+
 def test_no_gradient_is_taken_for_the_source() -> None:
     """On another survey the waveform comes from where no field could make it, and nothing else is taken off."""
     rng = np.random.default_rng(8)

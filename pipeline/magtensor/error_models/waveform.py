@@ -23,6 +23,7 @@ LEAST_SHARE = 0.02  # of the vector's square that must lie in free directions: l
 # unless two levels tell each sample's state
 LEAST_IN_BAND = 12  # cosine coefficients from which a level of the spectrum is taken
 BANDS = 40
+MOST_SLOW = 2.0  # power of the noise over that of its fastest part: of more it is not white
 BENDING = 10.0
 
 
@@ -120,7 +121,7 @@ def _filtered(series: Array, rest: Array, information: float) -> Course:
     coefficients = dct(series, norm="ortho")
     power = coefficients**2
     noise = np.mean(dct(rest, axis=0, norm="ortho") ** 2, axis=1) if rest.shape[1] else np.ones(n)
-    gain, left, level = np.zeros(n), np.zeros(n), 0.0
+    gain, left, level, floor = np.zeros(n), np.zeros(n), 0.0, 0.0
     for a, b in itertools.pairwise(_edges(n)):
         floor = noise[a:b].mean() / information
         gain[a:b] = max(1.0 - floor / max(power[a:b].mean(), 1e-300), 0.0)
@@ -129,7 +130,8 @@ def _filtered(series: Array, rest: Array, information: float) -> Course:
     own = np.cumsum(gain * power)
     band = float(np.searchsorted(own, 0.9 * own[-1])) / (2.0 * n) if own[-1] > 0 else 0.0
     values, std = np.asarray(idct(gain * coefficients, norm="ortho")), float(np.sqrt(left.mean()))
-    switched = two_levels(series, float(np.sqrt(level)), values)
+    # a sample tells its state by itself only in white noise: in slow noise whatever wanders is near one of two levels
+    switched = two_levels(series, float(np.sqrt(level)), values) if level < MOST_SLOW * floor else None
     if switched is not None and switched[1] < std:
         return Course(switched[0], float(switched[0].std()), switched[1], band, switches=True)
     return Course(values, float(np.sqrt(own[-1] / n)), std, band)
