@@ -292,8 +292,22 @@ def disturbed(record: Record, state: State, how: Fitting) -> NDArray[np.bool_]:
 
 
 def settled(record: Record, state: State, how: Fitting) -> State:
-    """The fit at the end of a search: what nothing explains is a disturbance after all, and no part of it."""
-    return joint_state(record, state.adopted, replace(how, searching=False), state.theta, state.lines)
+    """The fit at the end of a search: what nothing explains is a disturbance after all, and no part of it.
+
+    Samples that were flagged before an effect had a name may be good ones. Of what follows the field, or remembers it,
+    they are not told, for error models do not look at the field of flagged ones: they are believed again if they fit
+    with what they saw themselves.
+    """
+    ended = replace(how, searching=False)
+    last = joint_state(record, state.adopted, ended, state.theta, state.lines)
+    keep = np.asarray(last.fit.keep)
+    if keep.all() or not state.adopted:
+        return last
+    every = joint_state(record, state.adopted, ended, last.theta, state.lines, seen=np.ones_like(keep))
+    if not (more := np.asarray(every.fit.keep) & ~keep).any():
+        return last
+    again = joint_state(record, state.adopted, ended, last.theta, state.lines, seen=keep | more)
+    return again if np.sum(again.fit.keep) > np.sum(keep) else last
 
 
 def reweighed(record: Record, state: State, how: Fitting) -> State:
