@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -199,7 +200,7 @@ def apply_and_refine(
     )  # fmt: skip
     from magtensor.offsets_apart import scatter_for, without_scatter
     from magtensor.platform_frame import as_fitted, with_refined_rotation
-    from magtensor.standing_out import flagged
+    from magtensor.standing_out import before_and_cleaned, flagged
     from magtensor.tensor.elements import five
     from magtensor.tensors import (
         assembled,
@@ -225,13 +226,14 @@ def apply_and_refine(
         here = those_here(adopted, theta, origins, as_fitted(calibration, fitted), survey, calibration)
         adopted, theta = here.adopted, here.theta
         known = calibration.values("calibration/noise_std") if "calibration/noise_std" in calibration else None
-        if judge and adopted:  # what an effect makes of the field beside a spike would be full of it
-            survey = flagged(survey, fitted, known, uniform=uniform)
-        before, survey = survey, cleaned(survey, as_fitted(calibration, fitted), adopted, theta, origins)
+        sensed = as_fitted(calibration, fitted)
+        clean = partial(cleaned, calibration=sensed, adopted=adopted, theta=theta, origins=origins)
+        judged = partial(flagged, calibration=fitted, noise=known, uniform=uniform)
+        before, survey = before_and_cleaned(survey, clean, judged) if judge and adopted else (survey, clean(survey))
         if rows is None:
             survey = without_unread(survey, adopted)
         if judge:
-            survey = flagged(survey, fitted, known, uniform=uniform)
+            survey = judged(survey)
         words = {
             "not_taken_off": here.left_in,
             "extrapolated": "; ".join(f"{name}: {how}" for name, how in here.beyond.items()),

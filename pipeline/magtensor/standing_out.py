@@ -8,6 +8,8 @@ sensors never do, only what is far beyond anything beside it.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from magtensor.calibration.joint_together import FALSE_REJECTION, LEAST_FOR_REJECTION
@@ -67,11 +69,36 @@ def flagged(survey: Survey, calibration: ArrayCalibration, noise: Array | None, 
         return survey
     alone = np.zeros(len(raw), dtype=bool)
     alone[usable] = standing_out([part[usable] for part in parts], None if gradient is None else gradient[usable])
+    return _without(survey, alone)
+
+
+def _without(survey: Survey, alone: Mask) -> Survey:
+    """A survey with samples (N,) taken out of use."""
     if not alone.any():
         return survey
     good = survey.good_by_sensor & ~alone[:, None]
     given = {"good": (("time", "sensor"), good, {"long_name": "may be used"})}
     return survey.merged(given, flag_ranges(survey.time, alone, by=BY, reason=REASON))
+
+
+def before_and_cleaned(
+    survey: Survey, cleaned: Callable[[Survey], Survey], judged: Callable[[Survey], Survey]
+) -> tuple[Survey, Survey]:
+    """A survey, and the same with known effects taken off, without what stands out whether or not they are.
+
+    What an effect makes of the field beside a spike would be full of it, so error models do not look at samples that
+    stand out. But in a quick turn the effect itself may: a sample that does not, when it is taken off by the field that
+    is seen there, is a good one.
+
+    Args:
+        cleaned: takes the effects off; judged: takes out of use what stands out (`flagged`).
+    """
+    doubted = judged(survey)
+    if not (alone := survey.good & ~doubted.good).any():
+        return survey, cleaned(survey)
+    wrong = alone & ~judged(cleaned(survey)).good
+    before = doubted if np.array_equal(wrong, alone) else _without(survey, wrong)
+    return before, cleaned(before)
 
 
 def standing_out(parts: list[Array], gradient: Array | None = None) -> Mask:

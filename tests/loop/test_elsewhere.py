@@ -27,6 +27,7 @@ from magtensor.recipe.plan import read_plan
 from magtensor.registry import Registry
 from magtensor.standing_out import REASON, standing_out
 
+TURNED = [100, 180, 260, 420, 500, 580]  # samples
 MOTION = scenario()["motion"] | {"duration_s": 600.0}
 VECTORS = [[0.9, -0.4, 0.6], [-0.5, 0.8, 0.1], [0.2, 0.5, -0.9], [0.7, -0.6, 0.3]]
 HEATER = {"type": "current_field", "nT_per_A": [[8.0 * v for v in w] for w in VECTORS], "channel": "current_heater"}
@@ -249,6 +250,29 @@ def test_spikes_of_another_survey_are_flagged(tmp_path: Path, folder: Path, plai
     assert clean["calibrated/good"].all()
     keep = calibrated["calibrated/good"]
     np.testing.assert_array_equal(calibrated["calibrated/b"][keep.values], clean["calibrated/b"][keep.values])
+
+
+def test_an_effect_in_a_quick_turn_is_taken_off_there_and_a_spike_is_flagged(tmp_path: Path) -> None:
+    """A sample of another attitude than those beside it stands out by its effect, and has nothing wrong with it."""
+    law = {
+        "type": "nonlinearity_cubic",
+        "nT_at_full_scale": [[60.0, -40.0, 20.0], [-30.0, 50.0, -60.0], [0.0] * 3, [0.0] * 3],
+    }
+    survey = survey_file(tmp_path, scenario(5, law, motion=MOTION))
+    loop = magtensor.close_loop(survey, search=["nonlinearity_cubic"])
+    assert [a["error_model"] for a in loop.verdict["adopted"]] == ["nonlinearity_cubic"]
+    another = survey_file(tmp_path, scenario(6, law, motion=MOTION), "another.h5")
+    with h5py.File(another, "r+") as file:
+        raw = file["b_raw"][()]
+        raw[TURNED], raw[[t + 300 for t in TURNED]] = raw[[t + 300 for t in TURNED]], raw[TURNED].copy()
+        raw[350, 3, 1] += 40.0
+        file["b_raw"][...] = raw
+    calibrated = loop.calibration.apply(another)
+    assert np.flatnonzero(~calibrated["calibrated/good"].values).tolist() == [350]
+    b = calibrated["calibrated/b"].values
+    apart = np.linalg.norm(b - b.mean(axis=1, keepdims=True), axis=(1, 2))
+    apart[350] = np.nan
+    assert np.nanmax(apart[TURNED]) < 1.5 * np.nanquantile(apart, 0.99)
 
 
 def test_a_survey_of_two_sensors_whose_places_are_known(tmp_path: Path) -> None:
