@@ -14,6 +14,7 @@ SCHEMA = 1
 ERRORS = {"total_field_rms_nT": ("total field", "nT"), "tensor_rms_nT_per_m": ("tensor", "nT/m")}
 WORSE = 1.1  # times another error: clearly more
 OVERFITTED = 3.0  # the error on blocks that were not seen, over that of the fit
+LITTLE = 0.25  # of the variance beyond that of held-out blocks
 DISAGREES = 3.0  # times the error on held-out blocks
 
 
@@ -190,7 +191,7 @@ def _disagreement(outcome: dict[str, Any]) -> str:
     if contradicted:
         return f"; |b| would be nearer to the verification survey's total field without {contradicted}"
     if not apart:
-        return ""
+        return _carried_over(held_out, before, after)
     each = {s: v for s, v in after.items() if s != "all" and v is not None and here.get(s)}
     sensors = [s for s, v in each.items() if v > DISAGREES * here[s]]
     where = f" of {', '.join(sensors)}" if 0 < len(sensors) < len(each) else ""
@@ -206,6 +207,21 @@ def _disagreement(outcome: dict[str, Any]) -> str:
             "off: noise or disturbances of its own"
         )
     return words
+
+
+def _carried_over(held_out: dict[str, Any], before: dict[str, Any], after: dict[str, Any]) -> str:
+    """Words where what takes off most of the error of held-out blocks takes off little of a verification survey's."""
+    key = "total_field_rms_nT"
+    noise = _of_all(held_out["after"], key)
+    here = _of_all(held_out.get("before") or {}, key) ** 2 - noise**2
+    there = before["all"] ** 2 - noise**2
+    gone = before["all"] ** 2 - after["all"] ** 2
+    if here < noise**2 or there < noise**2 or gone > LITTLE * there:
+        return ""
+    return (
+        f"; of what the verification survey errs by beyond that, what was added takes off {gone / there:.0%} only: the "
+        "law may be another one, or something else is beside it there"
+    )
 
 
 def _unseen(error: dict[str, Any]) -> str:

@@ -140,7 +140,7 @@ def telegraph(seed: int, time: Array, dwell_s: float) -> Array:
     ("survey", "seed", "dwell_s", "size", "models", "words"),
     [
         (96, 7, 40.0, 0.3, ["offset_while", "turn_step"], "no lone event"),
-        (94, 5, 90.0, 1.0, ["offset_while", "offset_step"], "switches along one vector"),
+        (94, 5, 90.0, 1.0, ["offset_while", "offset_step"], "it acts at other times too"),
     ],
     ids=["one is found", "several are found"],
 )
