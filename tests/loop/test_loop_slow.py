@@ -15,6 +15,7 @@ from scipy.stats import norm
 
 from magtensor.calibration.joint import calibrated
 from magtensor.error_models.smoothing import smoothed
+from magtensor.loop.correcting.another_survey import tone_here
 from magtensor.loop.correcting.correction import corrected_raw
 from magtensor.loop.evidence.colour import Colour, colour_of
 from magtensor.loop.evidence.multiplicity import effective_tests
@@ -213,6 +214,32 @@ def test_a_tone_is_taken_off_with_the_phase_and_strength_it_has_here(
     raw = corrected_raw(disturbed, calibration, [model], [theta])
     # two numbers found from 32 000 contrasts with 0.15 nT of noise each
     assert np.std(raw - record.raw) < 0.01
+
+
+def test_a_weak_tone_is_found_beside_a_strong_effect_and_not_said_to_stay(tmp_path: Path) -> None:
+    """A drift of 20 nT hides a tone of 0.1 nT until it is taken off."""
+    record = loaded(tmp_path, scenario(22))
+    calibration = calibrated(joint_state(record, [], Fitting()).fit)
+    rng = np.random.default_rng(4)
+    cosines, sines = 0.1 * rng.standard_normal((2, 4, 3))
+    phase = 2 * np.pi * 0.23 * (record.time - record.start) + 0.4
+    tone = np.cos(phase)[:, None, None] * cosines + np.sin(phase)[:, None, None] * sines
+    drift = 40.0 * rng.standard_normal((4, 3))
+    course = (record.time - record.start) / (record.time[-1] - record.start)
+    registry = Registry.load()
+    span = float(record.time[-1] - record.start)
+    models = [
+        Adopted(registry.find("error_model", "offset_drift"), {"order": 1, "span_s": span}),
+        Adopted(registry.find("error_model", "periodic_interference"), {"frequency_Hz": 0.23}),
+    ]
+    theta = [drift.ravel() / 2.0, np.concatenate([cosines.ravel(), sines.ravel()])]
+    disturbed = replace(record, raw=record.raw + course[:, None, None] * drift + tone)
+    every = list(zip(models, theta, strict=True))
+    assert tone_here(disturbed, calibration, *every[1], None, every[1:]) is None
+    assert tone_here(disturbed, calibration, *every[1], None, every) is not None
+    raw = corrected_raw(disturbed, calibration, models, theta)
+    left = (raw - record.raw) - (raw - record.raw).mean(axis=0)
+    assert np.std(left) < 0.01
 
 
 @pytest.mark.long

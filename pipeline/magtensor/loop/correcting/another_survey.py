@@ -43,7 +43,7 @@ def as_begun_here(
     """
 
     def of_a_tone(model: Adopted, theta: Array) -> Array:
-        here = tone_here(record, calibration, model, theta, good)
+        here = tone_here(record, calibration, model, theta, good, own)
         return np.zeros_like(theta) if here is None else here
 
     begun = [(a, of_a_tone(a, t) if a.name == TONE else t) for a, t in own]
@@ -92,7 +92,12 @@ class _Contrast:
 
 
 def tone_here(
-    record: Record, calibration: ArrayCalibration, model: Adopted, theta: Array, good: NDArray[np.bool_] | None
+    record: Record,
+    calibration: ArrayCalibration,
+    model: Adopted,
+    theta: Array,
+    good: NDArray[np.bool_] | None,
+    own: Sequence[tuple[Adopted, Array]],
 ) -> Array | None:
     """Coefficients of a tone with the phase and strength it has on this survey; what one survey began with is another's
     accident.
@@ -100,6 +105,10 @@ def tone_here(
     Found by least squares over the tone as it was and a quarter of a turn later, in what neither a uniform field nor a
     gradient can make of the outputs (with fewer than four sensors: in their differences). None where these do not show
     it: of a single sensor, and of a tone that all sensors see alike.
+
+    Parameters
+    ----------
+    record: its outputs at their time; own: the effects in these, without which the tone is sought, but for tones.
     """
     contrast = _Contrast.of(record, calibration, good)
     raw = np.nan_to_num(record.raw)
@@ -115,13 +124,15 @@ def tone_here(
     still = all(np.sum((course - course.mean(axis=0)) ** 2) < LEAST_CONTRAST * strengths[0] for course in each)
     if still:  # a tone that the sampling shows as a constant has no phase
         return theta
-    found = contrast(raw - calibration.offset).ravel()
-    own = np.linalg.lstsq(both, found, rcond=LEAST_CONTRAST)[0]
-    noise = float(np.mean((found - both @ own) ** 2))
+    left = Here.of(record, calibration, good).left([(a, t) for a, t in own if a.name != TONE])
+    found = (left - left.mean(axis=0)).ravel()  # whatever the offsets are
+    both = np.column_stack([(course - course.mean(axis=0)).ravel() for course in each])
+    parts = np.linalg.lstsq(both, found, rcond=LEAST_CONTRAST)[0]
+    noise = float(np.mean((found - both @ parts) ** 2))
     scatter = noise * np.linalg.pinv(both.T @ both, rcond=LEAST_CONTRAST, hermitian=True)
-    if SIGNIFICANT**2 * np.diagonal(scatter).max() > min(1.0, float(own @ own)):  # of its strength
+    if SIGNIFICANT**2 * np.diagonal(scatter).max() > min(1.0, float(parts @ parts)):  # of its strength
         return None
-    out: Array = own[0] * theta + own[1] * later
+    out: Array = parts[0] * theta + parts[1] * later
     return out
 
 

@@ -59,27 +59,16 @@ def corrected_raw(
         waveform = hidden_waveform(left, calibration, record.position, theta[hidden], noise, good)
         record = replace(record, waveform=waveform)
     own = [(a, t) for a, t in zip(adopted, theta, strict=True) if a.component.effect == "instrument"]
-    raw = record.raw
     if not own:
-        return raw
-    forward = np.linalg.inv(calibration.matrix)
-
-    def terms_for(raw: Array, models: Sequence[Adopted]) -> list[Terms]:
-        b = filled(record.believed(calibration.apply(raw)), good)
-        if good is not None:
-            b = over_disturbances(b, good, record.time, record.run)
-        x = record.excitation(by_sensor(forward, b) + calibration.offset, b, matrix=np.asarray(forward, dtype=float))
-        return [model.terms(x) for model in models]
-
-    each = terms_for(raw, [model for model, _ in own])
-    record = replace(record, raw=_on_time(record, each, [t for _, t in own], good))
+        return record.raw
+    record, own = on_its_time(record, calibration, own, good)
     raw = record.raw
-    own = [pair for terms, pair in zip(each, own, strict=True) if terms.delay is None]
     own = as_begun_here(record, calibration, own, good)
     models, theta = [model for model, _ in own], [t for _, t in own]
     last = np.inf
     for _ in range(MOST_STEPS if own else 0):
-        after = cleared(record.raw, record.time, record.run, terms_for(raw, models), theta)
+        each = _terms(record, calibration, raw, models, good)
+        after = cleared(record.raw, record.time, record.run, each, theta)
         moves = np.abs(after - raw)
         raw = after
         if float(np.nanmax(moves, initial=0.0)) < SETTLED_NT:
@@ -93,6 +82,27 @@ def corrected_raw(
             )
         last = usual
     return raw
+
+
+def on_its_time(
+    record: Record, calibration: ArrayCalibration, own: Sequence[tuple[Adopted, Array]], good: NDArray[np.bool_] | None
+) -> tuple[Record, list[tuple[Adopted, Array]]]:
+    """A record whose outputs are at their time, and the effects of the instrument that are not delays of these."""
+    each = _terms(record, calibration, record.raw, [model for model, _ in own], good)
+    record = replace(record, raw=_on_time(record, each, [t for _, t in own], good))
+    return record, [pair for terms, pair in zip(each, own, strict=True) if terms.delay is None]
+
+
+def _terms(
+    record: Record, calibration: ArrayCalibration, raw: Array, models: Sequence[Adopted], good: NDArray[np.bool_] | None
+) -> list[Terms]:
+    """What error models make of the field that outputs (N, S, 3) nT tell."""
+    forward = np.asarray(np.linalg.inv(calibration.matrix), dtype=float)
+    b = filled(record.believed(calibration.apply(raw)), good)
+    if good is not None:
+        b = over_disturbances(b, good, record.time, record.run)
+    x = record.excitation(by_sensor(forward, b) + calibration.offset, b, matrix=forward)
+    return [model.terms(x) for model in models]
 
 
 def _on_time(record: Record, each: Sequence[Terms], theta: Sequence[Array], good: NDArray[np.bool_] | None) -> Array:

@@ -18,7 +18,7 @@ from magtensor.error_models.waveform import NAME
 from magtensor.errors import DataError, UsageError
 from magtensor.loop.correcting.another_survey import TONE, WARM_UP, shows_a_state, tone_here, unknown
 from magtensor.loop.correcting.beyond import extrapolated, seen_here
-from magtensor.loop.correcting.correction import corrected_raw, corrected_reference, hidden_objection
+from magtensor.loop.correcting.correction import corrected_raw, corrected_reference, hidden_objection, on_its_time
 from magtensor.loop.correcting.dates import LONG, as_dated_here
 from magtensor.loop.correcting.lengths import AVERAGING, contradicted, refuted
 from magtensor.loop.fitting.model import Adopted, Record, unread
@@ -212,14 +212,20 @@ def those_here(
         if asked_here and refuted(name, record, fitted, here.adopted, here.theta, survey.good):
             why = f"{name} ({beyond[name]})" if name in beyond else name
             here = _without(here, name, refuted="; ".join(w for w in (here.refuted, why) if w))
-    tones = [(a, t) for a, t in zip(here.adopted, here.theta, strict=True) if a.name == TONE]
-    if len(survey.sensors) > 1 and any(tone_here(record, fitted, a, t, survey.good) is None for a, t in tones):
+    if TONE in asked and len(survey.sensors) > 1 and _a_tone_does_not_show(record, fitted, here, survey.good):
         words = f"{TONE}: what differs between the sensors does not show it, and its phase, on this survey"
         here = replace(here, left_in="; ".join(w for w in (here.left_in, words) if w))
     if NAME in asked and (why := hidden_objection(record, fitted, here.adopted, here.theta, survey.good)):
         words = f"{NAME}: {why}"
         here = _without(here, NAME, left_in="; ".join(w for w in (here.left_in, words) if w))
     return here
+
+
+def _a_tone_does_not_show(record: Record, fitted: ArrayCalibration, here: Here, good: NDArray[np.bool_] | None) -> bool:
+    every = zip(here.adopted, here.theta, strict=True)
+    own = [(a, t) for a, t in every if a.component.effect == "instrument" and a.name != NAME]
+    timely, rest = on_its_time(record, fitted, own, good)
+    return any(tone_here(timely, fitted, a, t, good, rest) is None for a, t in rest if a.name == TONE)
 
 
 def _without(here: Here, name: str, **words: str) -> Here:
