@@ -240,6 +240,36 @@ def test_readings_that_are_far_apart_are_no_more_than_they_are() -> None:
     assert as_if_every_sample.min() < 1e-4
 
 
+def swinging(rng: np.random.Generator, swings: tuple[float, float]) -> Array:
+    """A smooth series (N,) of unit rms, of sines with so many swings in a survey."""
+    time = np.linspace(0.0, 1.0, SAMPLES)
+    each = [np.sin(2.0 * np.pi * (rng.uniform(*swings) * time + rng.uniform())) for _ in range(4)]
+    course = rng.standard_normal(4) @ each
+    out: Array = (course - np.mean(course)) / np.std(course)
+    return out
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_of_what_is_smooth_and_strong_few_values_are_independent(seed: int) -> None:
+    """A field of the site that the base station does not see, 300 times the noise of |b| - F, and a course of the
+    station's that has nothing to do with it: both have kinks where the survey ends, and both are seen through noise
+    that turns with the platform. What pulsates in it is found."""
+    rng = np.random.default_rng(400 + seed)
+    record = synthetic(500 + seed, SAMPLES, turning_s=4.0, noise_nT=0.15)
+    raw = record.raw + 0.1 * rng.standard_normal((SAMPLES, 4, 3)) * np.array([3.0, 1.0, 0.3])
+    site, slow, fast = (swinging(rng, swings) for swings in ((0.3, 2.0), (0.3, 2.0), (30.0, 80.0)))
+    assert record.total_field is not None
+    field = record.total_field - 25.0 * site - 0.05 * fast
+    state = linear_state(replace(record, raw=raw, total_field=field, quiet_field=field))
+    noise = OwnNoise(state.residual, None)
+    of_none, of_both = (
+        noise.p_value(state.excitation.on_reference(course, "nT", "course").at(state.residual.samples))
+        for course in (slow, fast)
+    )
+    assert of_none > 1e-6
+    assert of_both < 1e-6
+
+
 def test_what_the_fit_takes_of_a_reference_is_no_evidence() -> None:
     """A constant is a scale of all sensors but for the variation of the field, which holds the station's noise."""
     state = read_rarely(310, 30, 0.3)

@@ -16,6 +16,7 @@ from __future__ import annotations
 import numpy as np
 
 from magtensor.calibration.types import Array
+from magtensor.loop.evidence.sensor_noise import octaves
 
 SPARE = 1.0  # values that a band has to hold more than a coefficient has directions: of fewer nothing is to be told
 SIZES = 12  # of the coefficients, from a hundredth to a quarter more than what explains all of a band
@@ -116,3 +117,20 @@ def _cosines(gathered: Array, counts: Array, rng: np.random.Generator) -> Array:
         out.flat[places] = cosine[taken]
         open_.flat[places] = False
     return out
+
+
+def in_octaves(column: Array, values: Array, taken: Array) -> float:
+    """P value of a column (N,) in values (N, D) of white noise over frequency, whose level is known from themselves.
+
+    Parameters
+    ----------
+    taken: (N, Q) orthonormal, what has been projected off all of these.
+    """
+    count, dimension = values.shape
+    edges = octaves(count)
+
+    def sums(each: Array) -> Array:
+        return np.add.reduceat(each, edges[:-1])
+
+    left = dimension * (np.diff(edges) - sums(np.sum(taken**2, axis=1)))
+    return one_series_p(left, sums(column[:, None] * values), sums(column**2), sums(np.sum(values**2, axis=1)))

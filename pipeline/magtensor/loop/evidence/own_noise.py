@@ -20,9 +20,10 @@ import numpy as np
 from magtensor.calibration.types import Array
 from magtensor.error_models.terms import REFERENCE, Terms, joined
 from magtensor.loop.evidence.columns import across_directions, along_the_field
-from magtensor.loop.evidence.estimate import IDENTIFIABLE, Own, identifiable
+from magtensor.loop.evidence.estimate import Own, identifiable
 from magtensor.loop.evidence.even_rate import EvenRate
-from magtensor.loop.evidence.one_series import one_series_p
+from magtensor.loop.evidence.of_a_course import of_a_course
+from magtensor.loop.evidence.one_series import in_octaves
 from magtensor.loop.evidence.other_times import as_at_other_times
 from magtensor.loop.evidence.residual import Residual, taken_off
 from magtensor.loop.evidence.sensor_noise import (
@@ -30,7 +31,6 @@ from magtensor.loop.evidence.sensor_noise import (
     bands,
     grams_in_bands,
     inverse_of,
-    octaves,
     over_frequency,
     smoothed_spectrum,
 )
@@ -155,19 +155,13 @@ class OwnNoise:
         the readings of the base station resolve: beyond these its noise is what was drawn from one reading to the next,
         and has no independent values.
         """
-        if self.residual.along is None:
+        residual = self.residual
+        if residual.along is None:
             return 1.0
         every = terms if self.given is None else joined([terms, self.given])
-        series = over_frequency(self._even(along_the_field(self.residual, [every]).made)) / self._root_along[:, None]
-        whole, others = series[:, 0], series[:, 1:]
-        free = self._free_along
-        more, size, _ = np.linalg.svd(others - free @ (free.T @ others), full_matrices=False)
-        taken = np.column_stack([free, more[:, size > _INNER_RANK * max(size.max(initial=0.0), 1.0)]])
-        column, values = (each - taken @ (taken.T @ each) for each in (whole, self._values_along))
-        if np.sum(column**2) <= IDENTIFIABLE * np.sum(whole**2):
-            return 1.0
-        resolved = slice(self._resolved)
-        return _in_octaves(column[resolved], values[resolved, None], taken[resolved])
+        columns = np.column_stack([residual.along, along_the_field(residual, [every]).made, residual.inner])
+        units = residual.reference_gain if residual.levels is None else None
+        return of_a_course(columns, units, self._even, self._resolved)
 
     def _of_one_series(self, terms: Terms) -> tuple[float, float]:
         """The same of a series that is added to outputs of sensors, by what differs between these: that any of them
@@ -222,7 +216,7 @@ class OwnNoise:
         column, seen = (each - taken @ (taken.T @ each) for each in (series[:, 0], seen))
         if np.sum(column**2) <= _INNER_RANK**2 * np.sum(series[:, 0] ** 2):
             return 1.0
-        return _in_octaves(column, seen, taken)
+        return in_octaves(column, seen, taken)
 
     def _given_series_into(self, outputs: Array) -> list[int]:
         """The numbers of the given terms' series that are in some outputs: one in the reference alone is not."""
@@ -409,23 +403,6 @@ def _one_series(terms: Terms) -> bool:
     return (
         of_one and terms.series.shape[1] == 1 and terms.delay is None and bool(np.all(terms.part_output != REFERENCE))
     )
-
-
-def _in_octaves(column: Array, values: Array, taken: Array) -> float:
-    """P value of a column (N,) in values (N, D) of white noise over frequency, whose level is known from themselves.
-
-    Parameters
-    ----------
-    taken: (N, Q) orthonormal, what has been projected off all of these.
-    """
-    count, dimension = values.shape
-    edges = octaves(count)
-
-    def sums(each: Array) -> Array:
-        return np.add.reduceat(each, edges[:-1])
-
-    left = dimension * (np.diff(edges) - sums(np.sum(taken**2, axis=1)))
-    return one_series_p(left, sums(column[:, None] * values), sums(column**2), sums(np.sum(values**2, axis=1)))
 
 
 def _course(spectrum: Array) -> Array:
