@@ -138,3 +138,42 @@ def test_a_temperature_refused_for_a_drift_beside_a_flexure_is_asked_again(tmp_p
         told = verdict_of(tmp_path, scenario(seed, *effects, motion=motion, logging=logging), models=models)
         assert adopted_names(told) == {"frame_flexure", "temperature_alignment"}
         assert not told["unexplained"]["present"], told["unexplained"]["description"]
+
+
+@pytest.mark.parametrize("warms", [False, True])
+def test_what_a_lag_that_is_not_known_yet_left_is_no_warming_up(warms: bool) -> None:
+    """A channel through a lag of a tenth of the survey, which began far from its equilibrium, fitted by three quarters
+    of that lag: the rest of what dies away needs another name as long as it is so."""
+    samples, tau = 1500, 150.0
+    rng = np.random.default_rng(17)
+    bell = np.exp(-0.5 * (np.arange(-80, 81) / 20.0) ** 2)
+    channel = np.convolve(rng.standard_normal(samples + 160), bell / np.sqrt(np.sum(bell**2)), mode="valid")
+    seen, now = np.empty(samples), channel[0] - 3.0
+    for i in range(samples):
+        seen[i] = now
+        after = channel[min(i + 1, samples - 1)]
+        for k in range(20):
+            now += (channel[i] + (after - channel[i]) * (k + 0.5) / 20.0 - now) / tau / 20.0
+    vectors = rng.uniform(-1.0, 1.0, (4, 3))
+    added = 2.0 * seen[:, None, None] * vectors
+    if warms:
+        added = added + np.exp(-np.arange(samples) / 400.0)[:, None, None] * 3.0 * rng.uniform(-1.0, 1.0, (4, 3))
+    record = replace(
+        synthetic(61, samples, noise_nT=0.15, turning_s=4.0, added=added),
+        logged={"heat": channel}, units={"heat": "1"}, origins={"heat": np.zeros(1)},
+    )  # fmt: skip
+    registry = Registry.load()
+    follows = {"channel": "heat", "power": 1, "lag_s": 0.75 * tau, "at_start": -2.5}
+    models = [
+        Adopted(registry.find("error_model", "channel_response"), follows),
+        Adopted(registry.find("error_model", "warm_up"), {"tau_s": 400.0}),
+    ]
+    how = replace(Fitting(), searching=True)
+    state = joint_state(record, models, how)
+    found = exchanged(record, state, [Step(state, (), None)], how, 0, 40)
+    assert (found is None) is warms
+    if found is not None:
+        after, step = found
+        assert step.dropped == ("warm_up",)
+        (model,) = after.state.adopted
+        assert model.settings["lag_s"] == pytest.approx(tau, rel=0.03)

@@ -3,22 +3,26 @@
 While other effects have no name yet, the model with more coefficients follows a part of them, and held-out blocks bear
 it out: a source near the rig explains more than a gradient of the site beside a nonlinearity that nobody has added.
 Beside all that was adopted later one with fewer coefficients may do as well, and one that was refused for it may be
-seen to do better; then it takes its place.
+seen to do better; then it takes its place. And one that made up for what the others' settings were not yet is gone.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-from magtensor.loop.fitting.model import Fitting, Record, State, generic
+from magtensor.error_models.settings import Range, profiled
+from magtensor.loop.fitting.model import Adopted, Fitting, Record, State, generic
 from magtensor.loop.fitting.separation import fold_gain, separated
-from magtensor.loop.fitting.trial import Trial, per_sample, trial
-from magtensor.loop.searching.contribution import put_back_one, slices, without_models
+from magtensor.loop.fitting.trial import Trial, on_the_folds_of, per_sample, trial
+from magtensor.loop.searching.adopting import polished
+from magtensor.loop.searching.beginnings import beginning
+from magtensor.loop.searching.contribution import KEEP_ALPHA, happens_once, put_back_one, slices, without_models
 from magtensor.loop.searching.course_of_time import beside_time
 from magtensor.loop.searching.found import Step
 from magtensor.loop.searching.gates import Candidate
 from magtensor.loop.searching.keeping import fitted
+from magtensor.loop.searching.kin import TIME, drivers
 from magtensor.loop.searching.rivals import hardly_begun
 from magtensor.loop.searching.screening import candidates_of
 
@@ -82,11 +86,11 @@ def exchange(state: State, steps: Sequence[Step], fixed: int) -> Exchange | None
 def exchanged(
     record: Record, state: State, steps: Sequence[Step], how: Fitting, fixed: int, models: int
 ) -> tuple[Trial, Step] | None:
-    """The fit with another model in the place of an adopted one that it does as well as, or better, and the round's
-    story."""
+    """The fit with another model in the place of an adopted one that it does as well as, or better, or with none in the
+    place of one that is not needed any more; and the round's story."""
     found = exchange(state, steps, fixed)
     if found is None:
-        return None
+        return _without_a_course(record, state, steps, how, fixed)
     old = state.adopted[found.place].name
     without = without_models(record, state, [found.place], how)
     chosen = looked_at_again(without, found.other, models)
@@ -109,3 +113,39 @@ def looked_at_again(state: State, other: Candidate, models: int) -> Candidate | 
         return None
     again = found[0].among(models)
     return again if again.passes else None
+
+
+def _without_a_course(
+    record: Record, state: State, steps: Sequence[Step], how: Fitting, fixed: int
+) -> tuple[Trial, Step] | None:
+    """The fit without an adopted course of time, the settings of the others sought once more, if it does as well; and
+    the round's story.
+
+    What lags a channel is adopted before its lag, and what it began with, are well known, and a warming up then makes
+    up for them. Of what it explains beside the others as they are nobody sees that it is theirs.
+    """
+    from scipy.special import chdtrc
+
+    x = state.excitation
+    if not any(_lags(model) for model in state.adopted):
+        return None
+    before = trial(record, state, how)
+    for place in range(fixed, len(state.adopted)):
+        model = state.adopted[place]
+        if drivers(model, x) != {TIME} or happens_once(model):
+            continue
+        others = polished(record, without_models(record, state, [place], how), how)
+        after = trial(record, others, how)
+        lost = 2.0 * (per_sample(state) - per_sample(others)) * len(state.residual.affine)
+        freedom = len(state.theta[place]) + sum(isinstance(g, Range) for g in profiled(model.component).values())
+        if float(chdtrc(freedom, max(lost, 0.0))) < KEEP_ALPHA:
+            continue
+        if not on_the_folds_of(after, record, before, how).hurt_by(after):
+            return after, replace(steps[-1], dropped=(*steps[-1].dropped, model.name))
+    return None
+
+
+def _lags(model: Adopted) -> bool:
+    """Whether a model follows something through a lag, from a beginning that is found."""
+    found = beginning(model.component, model.settings)
+    return found is not None and bool(model.settings.get(found[1].lag))
