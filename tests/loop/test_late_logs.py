@@ -97,7 +97,7 @@ def test_a_thermometer_may_be_behind_the_sensor(change: Callable[[Path], None], 
     assert settings["delayed"] is delayed
     assert settings["lag_s"] == pytest.approx(-BEHIND_S, rel=0.1)
     assert evidence["held_out_rms_after_nT"] < 1.1 * found["noise_floor_nT"]
-    words = f"the log that temperature_offset follows is {-settings['lag_s']:.4g} s late"
+    words = f"temperature_offset acts {-settings['lag_s']:.4g} s before what it follows was logged, as where that log"
     assert (words in found["unexplained"]["description"]) is delayed
 
 

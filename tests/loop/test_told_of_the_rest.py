@@ -118,6 +118,16 @@ def test_a_field_that_the_base_station_does_not_see_is_no_noise() -> None:
     assert "above the white noise, mostly in |b| - F, alike in all sensors" in str(found["description"])
 
 
+@pytest.mark.parametrize(("amplitude_nT", "told_of"), [(0.6, True), (0.0, False)])
+def test_a_tone_of_the_base_station_is_told_with_its_period(amplitude_nT: float, told_of: bool) -> None:
+    """Beside something that wanders, which has none."""
+    walk = np.cumsum(np.random.default_rng(5).standard_normal(SAMPLES))
+    tone = amplitude_nT * np.sin(2.0 * np.pi * np.arange(SAMPLES) / 40.0)
+    words = str(told(beside(0.5 * walk / walk.std() + tone))["description"])
+    assert ("a line of |b| - F at 0.025 Hz (period 40 s), 0.4" in words) is told_of
+    assert told_of or "a line" not in words
+
+
 def test_a_base_station_that_wanders_a_little_is() -> None:
     found = told(beside(0.2 * np.sin(np.arange(SAMPLES) / 150.0)))
     assert not found["present"]

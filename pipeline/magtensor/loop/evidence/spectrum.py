@@ -95,6 +95,19 @@ def spectral_lines(residual: Residual, time: Array, most: int = 5) -> list[tuple
     return [(line.frequency_Hz, line.rms_nT, min(1.0, line.p)) for line in lines[:most]]
 
 
+def line_of_the_station(residual: Residual, time: Array) -> tuple[float, float, float] | None:
+    """(frequency Hz, rms nT, p) of the strongest peak of |b| - F itself, as an error of the base station makes it; None
+    where too many samples are missing, or there is no |b| - F."""
+    grid = _Grid.of(time) if len(time) >= _LEAST_SAMPLES else None
+    if grid is None or residual.along is None or len(time) < (1.0 - MOST_MISSING) * grid.n:
+        return None
+    left = (residual.along / residual.reference_gain)[:, None]
+    spectrum = grid.spectrum(left)
+    rms = np.sqrt(2.0) * np.abs(spectrum[:, 0]) / grid.n
+    found = _largest(spectrum, left, rms, grid, 1, slow=True)
+    return (found[0].frequency_Hz, found[0].rms_nT, min(1.0, found[0].p)) if found else None
+
+
 def _between(residual: Residual, grid: _Grid, most: int) -> list[_Line]:
     """Of what differs between the sensors. What C took of slow noise turns with the platform, at a rate that would seem
     a line, and is put back (`colour.beside_the_field`)."""

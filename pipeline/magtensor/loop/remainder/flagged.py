@@ -80,8 +80,8 @@ def unread_words(state: State, record: Record) -> list[str]:
     if late > LONGEST_SPIKE:
         model = min(state.adopted, key=lambda model: model.shifted_s)
         words.append(
-            f"the log that {model.name} follows is {-model.shifted_s:.4g} s late: the last {late} samples, of "
-            "which it tells nothing, are flagged and have no part in the calibration"
+            f"{model.name} acts {-model.shifted_s:.4g} s before what it follows was logged, as where that log is late: "
+            f"the last {late} samples, of which it tells nothing, are flagged and have no part in the calibration"
         )
     if early > LONGEST_SPIKE:
         model = max(state.adopted, key=lambda model: model.shifted_s)

@@ -14,7 +14,7 @@ import numpy as np
 from magtensor.calibration.types import Array
 from magtensor.loop.evidence.own_noise import OwnNoise
 from magtensor.loop.evidence.residual import Residual
-from magtensor.loop.evidence.spectrum import spectral_lines
+from magtensor.loop.evidence.spectrum import line_of_the_station, spectral_lines
 from magtensor.loop.fitting.model import Record, State
 from magtensor.loop.fitting.refit import disturbed
 from magtensor.loop.remainder.changing_matrix import changing_matrices
@@ -113,6 +113,10 @@ def _what_shows(found: Search, record: Record, excess: float, sparse: SparseRead
         turning = of_the_turning(state.excitation, line[:1], line[1:])[0]
         too = ", where the platform's turning has one too" if turning else ""
         words.append(f"a line at {line[0]:.4g} Hz (period {1 / line[0]:.4g} s), {line[1]:.3g} nT rms{too}")
+    elif _seen_alike(state.residual):
+        alone = line_of_the_station(state.residual, record.time[state.residual.samples])
+        if alone is not None and alone[2] < ALPHA and alone[1] ** 2 >= OF_A_LINE * excess**2:
+            words.append(f"a line of |b| - F at {alone[0]:.4g} Hz (period {1 / alone[0]:.4g} s), {alone[1]:.3g} nT rms")
     following, changing = shared_out(
         lambda of: of(state), [attitude_words, lambda state: [m.words for m in changing_matrices(state, ALPHA)]]
     )
