@@ -9,7 +9,7 @@ import pytest
 from loop_cases import linear_state, synthetic
 
 from magtensor.loop.fitting.model import Record
-from magtensor.loop.remainder.excess import excess_rms
+from magtensor.loop.remainder.excess import excess_rms, white_noise
 
 SAMPLES, HELD = 2400, 10
 
@@ -55,3 +55,17 @@ def test_an_error_of_the_total_field_is_one_along_the_field() -> None:
     off = np.repeat(values / np.sqrt(np.mean(values**2)), HELD)
     found = excess_rms(linear_state(replace(record, total_field=record.total_field + off)))
     assert found == pytest.approx(1.0 / np.sqrt(3.0), rel=0.1)  # of its square each axis has a third
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_noise_is_told_from_much_that_turns_with_the_platform(seed: int) -> None:
+    """A law of the attitude, a thousand times the noise, that turns in some ten samples: what is fastest holds the
+    least of it. Where there is none, the noise is what the residual is divided by."""
+    rng = np.random.default_rng(seed)
+    plain = synthetic(seed, SAMPLES, noise_nT=0.15, turning_s=12.0)
+    turned = plain.raw[:, :1] * plain.raw[:, :1, ::-1] / 5e4**2
+    bent = replace(plain, raw=plain.raw + 400.0 * turned * rng.standard_normal((4, 3)))
+    residual = linear_state(bent).residual
+    assert 0.14 < white_noise(residual) < 0.5 * residual.scale
+    residual = linear_state(plain).residual
+    assert white_noise(residual) == residual.scale == pytest.approx(0.15, rel=0.05)

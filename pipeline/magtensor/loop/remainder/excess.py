@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from math import comb
+
 import numpy as np
 
 from magtensor.calibration.types import Array
 from magtensor.loop.evidence.residual import Residual
 from magtensor.loop.fitting.model import State
 
+FAR_MORE = 4.0  # times the square that noise would leave
+TIMES = 4  # that differences are taken, from one sample to the next
+MEDIAN = 0.4549  # of the square of a normal variable
 SHOWN = 2.0  # standard deviations of what white noise makes of it by chance
 
 
@@ -21,6 +26,20 @@ def excess_rms(state: State) -> float:
     """
     shown, above = _shown(state.residual)
     return float(np.sqrt(_of_outputs(shown, above, state.residual)))
+
+
+def white_noise(residual: Residual) -> float:
+    """nT, the noise of an output, rms over these: what the residual was divided by, unless far more is left between the
+    sensors than that. Then it is what is fastest there."""
+    across = residual.across
+    if across is None:
+        return residual.scale
+    one = float(np.mean(np.diagonal(residual.projector)))
+    if float(np.mean(across**2)) < FAR_MORE * one:
+        return residual.scale
+    fast = np.diff(across, n=TIMES, axis=0)
+    level = float(np.mean(np.median(fast**2, axis=0))) / (MEDIAN * comb(2 * TIMES, TIMES))
+    return residual.scale * float(np.sqrt(min(level / one, 1.0)))
 
 
 def _of_outputs(shown: Array, above: Array, residual: Residual) -> float:
