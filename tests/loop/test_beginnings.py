@@ -15,8 +15,10 @@ from magtensor import close_loop
 from magtensor.calibration.types import ArrayCalibration
 from magtensor.error_models.example import example_survey
 from magtensor.loop.correcting.another_survey import as_begun_here
-from magtensor.loop.fitting.model import Adopted
+from magtensor.loop.fitting.model import Adopted, Fitting
 from magtensor.loop.searching.beginnings import at_its_limit
+from magtensor.loop.searching.outcome import described
+from magtensor.loop.searching.search import search
 from magtensor.registry import Registry
 
 TAU_S = 150.0
@@ -218,3 +220,33 @@ def test_a_beginning_that_another_survey_hardly_shows_is_no_impossible_field(see
     print(began, came_from)
     assert np.linalg.norm(began[1:] - came_from[1:]) < 8e3
     assert abs(began[0] - came_from[0]) < 100e3  # twice the field
+
+
+def test_what_each_sensor_began_with_is_said_to_be_no_warming_up_of_its_own() -> None:
+    """Four thermometers, a lag of 60 s, and sensors that were all at 15 degC at the start: one number for all of them
+    is not what they began with, and something dies away as fast as they lag."""
+    samples, tau = 1500, 60.0
+    rng = np.random.default_rng(23)
+    bell = np.exp(-0.5 * (np.arange(-300, 301) / 75.0) ** 2)
+    drawn = rng.standard_normal((samples + 600, 4))
+    course = np.column_stack([np.convolve(column, bell / np.sqrt(np.sum(bell**2)), mode="valid") for column in drawn.T])
+    thermometers = 15.0 + 4.0 * course
+    felt = np.empty_like(thermometers)
+    now = np.full(4, 15.0)
+    for i in range(samples):
+        felt[i] = now
+        after = thermometers[min(i + 1, samples - 1)]
+        for k in range(20):
+            now = now + (thermometers[i] + (after - thermometers[i]) * (k + 0.5) / 20.0 - now) / tau / 20.0
+    added = (felt - 15.0)[:, :, None] * rng.uniform(-1.0, 1.0, (4, 3))
+    record = replace(
+        synthetic(71, samples, noise_nT=0.15, turning_s=4.0, added=added),
+        logged={"temperature": thermometers - thermometers.mean(axis=0)}, units={"temperature": "degC"},
+        origins={"temperature": thermometers.mean(axis=0)},
+    )  # fmt: skip
+    registry = Registry.load()
+    models = [registry.find("error_model", name) for name in ("temperature_offset", "warm_up")]
+    told = described(search(record, models, Fitting()), record, 0)
+    adopted = {a["error_model"]: a for a in told["adopted"]}
+    assert adopted["temperature_offset"]["settings"]["lag_s"] == pytest.approx(tau, rel=0.05)
+    assert "dies away as fast as temperature_offset lags" in adopted["warm_up"]["means"]

@@ -36,6 +36,12 @@ def beginning(model: Component, settings: Mapping[str, Any]) -> tuple[list[str],
     return (names, found[0][1]) if names else None
 
 
+def lags(model: Adopted) -> float:
+    """s, through which a model follows something, from a beginning that is found; 0 of one that does not."""
+    found = beginning(model.component, model.settings)
+    return 0.0 if found is None else float(model.settings.get(found[1].lag, 0.0))
+
+
 def extent(model: Component, settings: Mapping[str, Any], x: Excitation) -> float:
     """What a response may be out of equilibrium by: ten times the width of the channel that it follows, or twice the
     field."""

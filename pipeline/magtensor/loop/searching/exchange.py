@@ -12,11 +12,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from magtensor.error_models.settings import Range, profiled
-from magtensor.loop.fitting.model import Adopted, Fitting, Record, State, generic
+from magtensor.loop.fitting.model import Fitting, Record, State, generic
 from magtensor.loop.fitting.separation import fold_gain, separated
 from magtensor.loop.fitting.trial import Trial, on_the_folds_of, per_sample, trial
 from magtensor.loop.searching.adopting import polished
-from magtensor.loop.searching.beginnings import beginning
+from magtensor.loop.searching.beginnings import lags
 from magtensor.loop.searching.contribution import KEEP_ALPHA, happens_once, put_back_one, slices, without_models
 from magtensor.loop.searching.course_of_time import beside_time
 from magtensor.loop.searching.found import Step
@@ -127,7 +127,7 @@ def _without_a_course(
     from scipy.special import chdtrc
 
     x = state.excitation
-    if not any(_lags(model) for model in state.adopted):
+    if not any(lags(model) for model in state.adopted):
         return None
     before = trial(record, state, how)
     for place in range(fixed, len(state.adopted)):
@@ -143,9 +143,3 @@ def _without_a_course(
         if not on_the_folds_of(after, record, before, how).hurt_by(after):
             return after, replace(steps[-1], dropped=(*steps[-1].dropped, model.name))
     return None
-
-
-def _lags(model: Adopted) -> bool:
-    """Whether a model follows something through a lag, from a beginning that is found."""
-    found = beginning(model.component, model.settings)
-    return found is not None and bool(model.settings.get(found[1].lag))

@@ -10,12 +10,16 @@ import numpy as np
 from magtensor.error_models.excitation import Excitation
 from magtensor.error_models.settings import Beginning, Bends, EventTimes, Forms, Frequencies, Range, profiled
 from magtensor.error_models.waveform import NAME
-from magtensor.loop.fitting.model import CHANNEL, Adopted, Record
+from magtensor.loop.fitting.model import CHANNEL, Adopted, Record, State
 from magtensor.loop.fitting.refit import everywhere
+from magtensor.loop.searching.beginnings import lags
 from magtensor.loop.searching.contribution import happens_once
 from magtensor.loop.searching.found import Search, Step, without_and_with
 from magtensor.loop.searching.gates import Candidate
 from magtensor.loop.searching.on_fewer_sensors import named
+
+WARM_UP = "warm_up"
+AS_FAST = 0.15  # of a time constant
 
 
 def described(found: Search, record: Record, declared: int) -> dict[str, Any]:
@@ -104,6 +108,7 @@ def _adopted(found: Search, record: Record, index: int) -> dict[str, Any]:
     meaning = model.component.means
     found_of = dict(zip(zip(sensors, names, strict=True), map(float, state.theta[index]), strict=True))
     means = "" if meaning is None else meaning(_with_what_differs(found, record), model.settings, found_of)
+    means = means or _as_another_begins(state, index)
     return {
         "error_model": model.name,
         "kind": model.component.effect,
@@ -119,6 +124,17 @@ def _adopted(found: Search, record: Record, index: int) -> dict[str, Any]:
         **({"means": means} if means else {}),
         **({"most_like_channel": step.like} if step is not None and step.like else {}),
     }
+
+
+def _as_another_begins(state: State, index: int) -> str:
+    """What a warming up may be instead that dies away as fast as another effect lags: that began with one excess for
+    all sensors, and each may have had its own."""
+    model = state.adopted[index]
+    if model.name != WARM_UP:
+        return ""
+    tau = float(model.settings["tau_s"])
+    alike = [other.name for other in state.adopted if abs(lags(other) - tau) < AS_FAST * tau]
+    return f"dies away as fast as {alike[0]} lags: what each sensor had left of that at the start" if alike else ""
 
 
 def _with_what_differs(found: Search, record: Record) -> Excitation:
