@@ -303,10 +303,13 @@ def settled(record: Record, state: State, how: Fitting) -> State:
     keep = np.asarray(last.fit.keep)
     if keep.all() or not state.adopted:
         return last
-    every = joint_state(record, state.adopted, ended, last.theta, state.lines, seen=np.ones_like(keep))
-    if not (more := np.asarray(every.fit.keep) & ~keep).any():
+    try:
+        every = joint_state(record, state.adopted, ended, last.theta, state.lines, seen=np.ones_like(keep))
+        if not (more := np.asarray(every.fit.keep) & ~keep).any():
+            return last
+        again = joint_state(record, state.adopted, ended, last.theta, state.lines, seen=keep | more)
+    except DataError:  # what disturbs them is as large as the field
         return last
-    again = joint_state(record, state.adopted, ended, last.theta, state.lines, seen=keep | more)
     return again if np.sum(again.fit.keep) > np.sum(keep) else last
 
 
