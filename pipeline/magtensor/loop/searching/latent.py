@@ -43,10 +43,12 @@ from magtensor.loop.fitting.trial import per_sample
 from magtensor.loop.searching.contribution import happens_once, without_models
 from magtensor.loop.searching.gates import OF_THE_LAW, Candidate, explained_before, explained_by, gained_of_a_log
 from magtensor.loop.searching.likeness import (
+    FEW,
     effect_along,
     followed,
     followed_by_a_curve,
     held_out_losses,
+    independent,
     of_an_unseen_path,
 )
 
@@ -59,7 +61,6 @@ LEAST_NOISE = 0.1  # of what the fit believes
 MOST_OF_A_SAMPLE = 50.0  # log likelihood: half of the largest squared residual of a sample that noise may explain
 IMPROPER = 1 / 3  # of the noise of a sensor's usual axis
 SINGLE_STRETCH = "it acts in a single short stretch, which no other can confirm"
-FEW = 8.0  # independent values: any course with fewer is like some channel, through some power and lag
 ONCE = 0.9  # of a waveform's power in a stretch as long as one that is held out
 OF_A_CHANNEL = "its waveform follows channel"
 SECOND = 0.1  # a second factor this strong beside the first: not one waveform
@@ -383,14 +384,6 @@ def _turning(record: Record, state: State) -> bool:
         for columns in (np.column_stack([affine, *laws[:k]]) for k in (1, 2))
         if n >= 4 * columns.shape[1]
     )
-
-
-def independent(waveform: Array) -> float:
-    """How many independent values a waveform (N,) amounts to: of sines and cosines with as much power each, so many."""
-    from scipy.fft import rfft
-
-    power = np.abs(rfft(waveform - waveform.mean())) ** 2
-    return float(2.0 * power.sum() ** 2 / max(np.sum(power**2), 1e-300))
 
 
 def shared_words(found: Sought, sensors: Sequence[str]) -> str:

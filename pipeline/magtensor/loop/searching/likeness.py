@@ -22,6 +22,10 @@ COMPARED = 400  # points at which it is
 LIKE_AN_EFFECT = 0.9  # cosine; of two directions off the plane of four sensors one pair in a thousand is nearer
 ONE_SENSOR = 0.9  # of what something that happened once does
 ONE_DIRECTION = 0.9  # of an effect's power
+PARTS = 50  # of the survey, between which what follows a channel may begin or end to
+MOST_OF_IT = 0.8  # of a waveform's square
+MUCH_LESS = 0.5  # of what the channel leaves of it all along
+FEW = 8.0  # independent values: any course with fewer is like some channel, through some power and lag
 REMEMBERS = 0.3  # of its size, what other samples change of a regressor that remembers the field there
 
 
@@ -64,6 +68,50 @@ def followed_by_a_curve(time: Array, values: Array, record: Record) -> str:
         shares[name] = 1.0 - float(held_out_losses(values, columns, edges).sum()) / whole
     best = max(shares, key=lambda name: shares[name], default="")
     return best if best and shares[best] > LIKE_A_CHANNEL**2 else ""
+
+
+def followed_in_part(time: Array, values: Array, record: Record) -> str:
+    """The channel with one value that a waveform follows from some time on, or until then, and rests otherwise, in
+    words; "" where none makes most of its square so, and by far more than all along."""
+    best, words, whole = 0.0, "", float(np.sum((values - values.mean()) ** 2))
+    if whole == 0.0:
+        return words
+    for name, channel in record.logged.items():
+        if channel.ndim > 1:
+            continue
+        course = np.interp(time, record.time, channel)
+        always = _left_by(course, values)
+        for edge in np.linspace(0.0, len(time), PARTS + 1).round().astype(int)[PARTS // 10 : -(PARTS // 10)]:
+            early, late = slice(None, edge), slice(edge, None)
+            for acts, rests, when in ((late, early, "from {:.4g} s on"), (early, late, "until {:.4g} s")):
+                left = _left_by(course[acts], values[acts]) + float(np.sum((values[rests] - values[rests].mean()) ** 2))
+                share = 1.0 - left / whole
+                if share <= max(best, MOST_OF_IT) or left >= MUCH_LESS * always:
+                    continue
+                if _comes_and_goes(course[acts]) and _comes_and_goes(values[acts]):
+                    best, words = share, f"{name} {when.format(time[edge] - record.time[0])}"
+    return words
+
+
+def _comes_and_goes(course: Array) -> bool:
+    """Whether a course crosses its mean so often that another one hardly does so at the same times."""
+    above = course > course.mean()
+    return independent(course) > FEW and int(np.count_nonzero(above[1:] != above[:-1])) > FEW
+
+
+def independent(waveform: Array) -> float:
+    """How many independent values a waveform (N,) amounts to: of sines and cosines with as much power each, so many."""
+    from scipy.fft import rfft
+
+    power = np.abs(rfft(waveform - waveform.mean())) ** 2
+    return float(2.0 * power.sum() ** 2 / max(np.sum(power**2), 1e-300))
+
+
+def _left_by(course: Array, values: Array) -> float:
+    """The square of values (n,) that a straight line of a course (n,) leaves."""
+    course, values = course - course.mean(), values - values.mean()
+    power = float(course @ course)
+    return float(values @ values) - (float(course @ values) ** 2 / power if power > 0.0 else 0.0)
 
 
 def held_out_losses(series: Array, columns: Array, edges: Array) -> Array:

@@ -16,6 +16,7 @@ from magtensor.loop.searching.beginnings import lags
 from magtensor.loop.searching.contribution import happens_once
 from magtensor.loop.searching.found import Search, Step, without_and_with
 from magtensor.loop.searching.gates import Candidate
+from magtensor.loop.searching.likeness import followed_in_part
 from magtensor.loop.searching.on_fewer_sensors import named
 
 WARM_UP = "warm_up"
@@ -109,6 +110,9 @@ def _adopted(found: Search, record: Record, index: int) -> dict[str, Any]:
     found_of = dict(zip(zip(sensors, names, strict=True), map(float, state.theta[index]), strict=True))
     means = "" if meaning is None else meaning(_with_what_differs(found, record), model.settings, found_of)
     means = means or _as_another_begins(state, index)
+    if model.name == NAME and not (step is not None and step.like) and record.waveform is not None:
+        follows = followed_in_part(record.time, record.waveform, record)
+        means = means or (f"goes as {follows}, and rests else" if follows else "")
     return {
         "error_model": model.name,
         "kind": model.component.effect,
