@@ -18,7 +18,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
+from magtensor.calibration.joint_together import ABOUT
 from magtensor.calibration.types import Array
 from magtensor.error_models.direction import turning_Hz
 from magtensor.error_models.settings import Frequencies, profiled
@@ -34,7 +36,7 @@ from magtensor.loop.remainder.predictable import (
     enough_for_the_total_field,
     predictable_in_the_total_field,
 )
-from magtensor.loop.searching.contribution import happens_once, slices
+from magtensor.loop.searching.contribution import happens_once, moments, slices
 from magtensor.loop.searching.found import Search, without_and_with
 from magtensor.loop.searching.suspects import unlikely
 from magtensor.loop.searching.unexplained import unexplained
@@ -43,6 +45,7 @@ WORSE = 1.01  # times the held-out rms without an effect, all noise alike: noise
 NAMELESS = 2.0  # times what stays, that a response to a logged vector explains if it is the law
 LONE = 2  # events along one vector may be all that happened, where nothing stays
 ALONG = 0.95  # cosine, with a source's vector or another event's; of one sensor 5 % of all directions are as near
+AS_MUCH = 0.25  # of an event, that it may differ by from what it is at another time
 HARMONICS = 16  # of the turning, that a law of the attitude with a corner shows
 
 
@@ -138,7 +141,8 @@ def _of_an_adopted_source(state: State, fixed: int) -> tuple[list[int], str] | N
 
 def of_what_is_left_out(found: Search, fixed: int) -> tuple[list[int], str] | None:
     """An offset that came or went, along whose vector nearly all goes that samples without a part in the calibration
-    are off by, and more than it explains: what it is a part of acts at other times too, by a law that has no name."""
+    are off by, and more than it explains, or by as much as it is: what it is a part of acts at other times too, by a
+    law that has no name."""
     state = found.told
     events = [i for i, a in enumerate(state.adopted) if i >= fixed and happens_once(a)]
     known = [(i, v) for i in events if (v := _vector(state, i)) is not None]
@@ -153,13 +157,32 @@ def of_what_is_left_out(found: Search, fixed: int) -> tuple[list[int], str] | No
         size = float(np.linalg.norm(seen))
         along = float(np.sum((off @ seen) ** 2)) / size**2 - len(off) if size > 0.0 else 0.0
         (series,) = state.adopted[place].terms(state.excitation).series[~out].T
-        if along > ALONG**2 * beyond and along > size**2 * float(np.sum((series - series.mean()) ** 2)):
+        if along <= ALONG**2 * beyond:
+            continue
+        more = along > size**2 * float(np.sum((series - series.mean()) ** 2))
+        if more or _as_large(off @ seen / size**2, np.flatnonzero(out), state, place):
             return (
                 [place],
-                f"what {len(off)} samples that fit no calibration are off by lies along its vector, and is more: "
-                "it acts at other times too",
+                f"what {len(off)} samples that fit no calibration are off by lies along its vector, and is "
+                f"{'more' if more else 'as large'}: it acts at other times too",
             )
     return None
+
+
+def _as_large(times: Array, samples: NDArray[np.int_], state: State, place: int) -> bool:
+    """Whether samples are off by an event once more, or by it the other way round, at another time: not at those beside
+    its own, where it may not have come or gone at once.
+
+    Parameters
+    ----------
+    times: (n,) of the event, that the samples (n,) are off by.
+    """
+    x = state.excitation
+    at = np.searchsorted(x.elapsed, moments(state.adopted[place]))
+    elsewhere = (np.abs(samples[:, None] - at) > ABOUT).all(axis=1)
+    if np.count_nonzero(elsewhere) <= ABOUT:
+        return False
+    return abs(abs(float(np.mean(times[elsewhere]))) - 1.0) < AS_MUCH
 
 
 def _of_one_that_switches(state: State, fixed: int) -> tuple[list[int], str] | None:
