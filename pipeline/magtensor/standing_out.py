@@ -31,7 +31,9 @@ WITHOUT_FOOT = (
 SURROUNDINGS = 101  # samples over which the level of the noise may change
 
 
-def flagged(survey: Survey, calibration: ArrayCalibration, noise: Array | None, *, uniform: bool) -> Survey:
+def flagged(
+    survey: Survey, calibration: ArrayCalibration, noise: Array | None, *, uniform: bool, longest: int = LONGEST
+) -> Survey:
     """A survey with the samples taken out of use that stand out alone.
 
     Args:
@@ -39,6 +41,7 @@ def flagged(survey: Survey, calibration: ArrayCalibration, noise: Array | None, 
         calibration: in the frame of the sensors' positions.
         noise: (S, 3) nT by which the outputs are weighed; all alike where it is not known.
         uniform: the field is known to be uniform, and to have the survey's total field where it has one.
+        longest: how many samples may stand out one after the other; more are left to speak for themselves.
     """
     raw, usable = np.asarray(survey.values("b_raw"), dtype=float), survey.good
     usable = usable & np.isfinite(raw).all(axis=(1, 2))
@@ -68,7 +71,8 @@ def flagged(survey: Survey, calibration: ArrayCalibration, noise: Array | None, 
     if (gradient is None and not parts) or usable.sum() < LEAST_FOR_REJECTION:
         return survey
     alone = np.zeros(len(raw), dtype=bool)
-    alone[usable] = standing_out([part[usable] for part in parts], None if gradient is None else gradient[usable])
+    seen = None if gradient is None else gradient[usable]
+    alone[usable] = standing_out([part[usable] for part in parts], seen, longest)
     return _without(survey, alone)
 
 
@@ -82,7 +86,7 @@ def _without(survey: Survey, alone: Mask) -> Survey:
 
 
 def before_and_cleaned(
-    survey: Survey, cleaned: Callable[[Survey], Survey], judged: Callable[[Survey], Survey]
+    survey: Survey, cleaned: Callable[[Survey], Survey], judged: Callable[..., Survey]
 ) -> tuple[Survey, Survey]:
     """A survey, and the same with known effects taken off, without what stands out whether or not they are.
 
@@ -96,12 +100,12 @@ def before_and_cleaned(
     doubted = judged(survey)
     if not (alone := survey.good & ~doubted.good).any():
         return survey, cleaned(survey)
-    wrong = alone & ~judged(cleaned(survey)).good
+    wrong = alone & ~judged(cleaned(survey), longest=len(alone)).good
     before = doubted if np.array_equal(wrong, alone) else _without(survey, wrong)
     return before, cleaned(before)
 
 
-def standing_out(parts: list[Array], gradient: Array | None = None) -> Mask:
+def standing_out(parts: list[Array], gradient: Array | None = None, longest: int = LONGEST) -> Mask:
     """(N,) samples at which any of several residuals (N, K) departs from its neighbours beyond noise, and alone.
 
     Where the outputs (N, G) that a gradient moves, in the same units, depart by so much more that the bend of a real
@@ -114,7 +118,7 @@ def standing_out(parts: list[Array], gradient: Array | None = None) -> Mask:
     found = _beyond_noise(parts, gradient, np.zeros(count, dtype=bool))
     out = found & _beyond_noise(parts, gradient, found)  # one of the first round may have had such neighbours
     for start, stop in in_a_row(out):
-        if stop - start > LONGEST:
+        if stop - start > longest:
             out[start:stop] = False
     return out
 
