@@ -10,6 +10,7 @@ import numpy as np
 from magtensor.error_models.excitation import Excitation
 from magtensor.error_models.settings import Beginning, Bends, EventTimes, Forms, Frequencies, Range, profiled
 from magtensor.error_models.waveform import NAME
+from magtensor.loop.correcting.another_survey import WARM_UP
 from magtensor.loop.fitting.model import CHANNEL, Adopted, Record, State
 from magtensor.loop.fitting.refit import everywhere
 from magtensor.loop.searching.beginnings import lags
@@ -19,7 +20,6 @@ from magtensor.loop.searching.gates import Candidate
 from magtensor.loop.searching.likeness import followed_in_part
 from magtensor.loop.searching.on_fewer_sensors import named
 
-WARM_UP = "warm_up"
 AS_FAST = 0.15  # of a time constant
 
 
