@@ -3,7 +3,8 @@
 While other effects have no name yet, the model with more coefficients follows a part of them, and held-out blocks bear
 it out: a source near the rig explains more than a gradient of the site beside a nonlinearity that nobody has added.
 Beside all that was adopted later one with fewer coefficients may do as well, and one that was refused for it may be
-seen to do better; then it takes its place. And one that made up for what the others' settings were not yet is gone.
+seen to do better; then it takes its place. A course of time that only made up for settings of the others, not
+found yet then, goes too.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from magtensor.error_models.settings import Range, profiled
+from magtensor.errors import DataError
 from magtensor.loop.fitting.model import Fitting, Record, State, generic
 from magtensor.loop.fitting.separation import fold_gain, separated
 from magtensor.loop.fitting.trial import Trial, on_the_folds_of, per_sample, trial
@@ -134,8 +136,11 @@ def _without_a_course(
         model = state.adopted[place]
         if drivers(model, x) != {TIME} or happens_once(model):
             continue
-        others = polished(record, without_models(record, state, [place], how), how)
-        after = trial(record, others, how)
+        try:
+            others = polished(record, without_models(record, state, [place], how), how)
+            after = trial(record, others, how)
+        except DataError:  # without it the others leave nothing to calibrate
+            continue
         lost = 2.0 * (per_sample(state) - per_sample(others)) * len(state.residual.affine)
         freedom = len(state.theta[place]) + sum(isinstance(g, Range) for g in profiled(model.component).values())
         if float(chdtrc(freedom, max(lost, 0.0))) < KEEP_ALPHA:

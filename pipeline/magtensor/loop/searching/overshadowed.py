@@ -169,20 +169,20 @@ def of_what_is_left_out(found: Search, fixed: int) -> tuple[list[int], str] | No
     return None
 
 
-def _as_large(times: Array, samples: NDArray[np.int_], state: State, place: int) -> bool:
+def _as_large(share: Array, samples: NDArray[np.int_], state: State, place: int) -> bool:
     """Whether samples are off by an event once more, or by it the other way round, at another time: not at those beside
     its own, where it may not have come or gone at once.
 
     Parameters
     ----------
-    times: (n,) of the event, that the samples (n,) are off by.
+    share: (n,) of the event, that the samples (n,) are off by.
     """
     x = state.excitation
     at = np.searchsorted(x.elapsed, moments(state.adopted[place]))
     elsewhere = (np.abs(samples[:, None] - at) > ABOUT).all(axis=1)
     if np.count_nonzero(elsewhere) <= ABOUT:
         return False
-    return abs(abs(float(np.mean(times[elsewhere]))) - 1.0) < AS_MUCH
+    return abs(abs(float(np.mean(share[elsewhere]))) - 1.0) < AS_MUCH
 
 
 def _of_one_that_switches(state: State, fixed: int) -> tuple[list[int], str] | None:
