@@ -3,6 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+PART ?= 1/1
 # as many workers as cores, one thread each; the tests of a file share what they have made
 PYTEST := OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n auto --dist loadfile
 
@@ -29,7 +30,7 @@ test: lint
 	$(PYTEST)
 
 test-long: $(STAMP)
-	$(PYTEST) -m long  # those that `make test` leaves out
+	$(PYTEST) -m long --part $(PART)  # those that `make test` leaves out; PART=2/12: the second of twelve parts
 
 bench: $(STAMP)
 	$(BIN)/python benchmarks/pipeline.py
