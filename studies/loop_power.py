@@ -87,6 +87,7 @@ RIGHT: dict[str, dict[str, Any]] = {
     "moving_part": {"channel": "encoder"},
     "periodic_interference": {"frequency_Hz": 49.7123},
     "channel_response": {"channel": "pressure", "power": 2, "lag_s": 3.0},
+    "channel_rate": {"channel": "pressure", "lag_s": 20.0},
     "reference_step": {"time_s": 700.0},
     "reference_while": {"time_s": 600.0, "until_s": 1000.0},
     "reference_drift": {"order": 3},

@@ -9,7 +9,7 @@ from magtensor_effects.ageing import (
     scale_step,
     warm_up,
 )
-from magtensor_effects.channels import channel_response, moving_part, periodic_interference
+from magtensor_effects.channels import channel_rate, channel_response, moving_part, periodic_interference
 from magtensor_effects.geometry import baseline_expansion, finite_baseline, position_error
 from magtensor_effects.inertia import (
     averaging,
@@ -48,6 +48,7 @@ __all__ = [
     "baseline_expansion",
     "calibration_step",
     "channel_alignment",
+    "channel_rate",
     "channel_response",
     "clock_drift",
     "cross_field",

@@ -18,6 +18,7 @@ from magtensor_effects.forms import AtStart, BentPower, Delayed, OfField, Smooth
 ATTITUDE_ANGLES = ("roll*", "pitch*", "yaw*", "heading*", "azimuth*", "course*", "latitude*", "longitude*")
 ENCODER = AnyChannel("encoder*", without=ATTITUDE_ANGLES, or_units="rad", vectors=False)
 ANY = AnyChannel("*")
+OTHER = AnyChannel("*", without=("temperature*", *ATTITUDE_ANGLES), but_units="degC", vectors=False)
 
 
 @error_model(
@@ -109,3 +110,38 @@ def channel_response(
     if x.is_vector(name):
         columns = [(f"{AXES[i]} ", per_unit, column) for i, column in enumerate((course**power).T)]
     return joined([x.scales(1e-6 * c, f"ppm/{unit}", label, of_field=of_field) for label, unit, c in columns])
+
+
+@error_model(
+    "instrument",
+    source="induction; first-order high-pass",
+    typical="unknown: a pick-up loop beside a current, a coupling capacitor, a kick whenever something is switched",
+    pointwise=True,
+)
+def channel_rate(
+    x: Excitation,
+    *,
+    channel: Annotated[
+        str,
+        OTHER,
+        Field(
+            description="any logged channel with one component but temperatures and attitude angles; '': the only one"
+        ),
+    ] = "",
+    lag_s: Annotated[
+        float,
+        Range(0.0, 300.0, count=6, spacing="log"),
+        Field(ge=0, description="time constant with which what a change has caused dies away, s"),
+    ] = 0.0,
+    smooth: Smooth = False,
+    at_start: AtStart = 0.0,
+) -> Terms:
+    """The output follows the rate of change of any logged channel, through a lag: where the channel jumps, a kick that
+    dies away.
+
+    Through a lag that is the channel less the lagged one, over lag_s. One coefficient an axis. What a current induces
+    in a loop, what comes through a capacitor. Rivals: `channel_response`, ahead by a quarter of a period where the
+    channel swings with one. Of a thermometer: `temperature_rate`.
+    """
+    name = OTHER.pick(x, channel)
+    return x.offsets(x.rate_of(name, lag_s, smooth, at_start), f"nT s/{x.units[name]}")

@@ -10,17 +10,16 @@ from magtensor.calibration.types import Array
 from magtensor.components import error_model
 from magtensor.error_models.acting import AXES
 from magtensor.error_models.excitation import Excitation
-from magtensor.error_models.settings import AnyChannel, LagsOf, Orders, Range
+from magtensor.error_models.settings import LagsOf, Orders, Range
 from magtensor.error_models.terms import Terms, joined
 from magtensor.units import GRAVITY
 from magtensor_effects.ageing import EventTime, Span
-from magtensor_effects.channels import ATTITUDE_ANGLES
+from magtensor_effects.channels import OTHER
 from magtensor_effects.forms import AtStart, Delayed, Smooth
 from magtensor_effects.temperature import THERMOMETER, ThermalLag, Thermometer
 
 ARCMIN = np.pi / (180.0 * 60.0)
 UP = np.array([0.0, 0.0, 1.0])
-LOAD = AnyChannel("*", without=("temperature*", *ATTITUDE_ANGLES), but_units="degC", vectors=False)
 
 Angles = Annotated[
     int,
@@ -124,7 +123,7 @@ def channel_alignment(
     *,
     channel: Annotated[
         str,
-        LOAD,
+        OTHER,
         Field(description="any logged channel with one component but temperatures and angles; '': the only one"),
     ] = "",
     lag_s: Annotated[
@@ -141,7 +140,7 @@ def channel_alignment(
     matrix that changes with time. Rivals: `temperature_alignment` where the temperature goes with the channel,
     `alignment_drift` where it rises steadily, `channel_response` where few attitudes are seen.
     """
-    name = LOAD.pick(x, channel)
+    name = OTHER.pick(x, channel)
     course = x.channel(name, lag_s, smooth=smooth)
     return joined(_by_an_arcmin(x, course, f"arcmin/{x.units[name]}", angles))
 

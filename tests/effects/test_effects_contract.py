@@ -26,7 +26,7 @@ CATALOGUE = {
         "crosstalk", "viscous_magnetisation", "moving_part", "periodic_interference", "frame_flexure",
         "channel_response", "finite_baseline", "position_error", "baseline_expansion", "latent_source",
         "scale_step", "turn_step", "calibration_step", "offset_while", "lag_step", "averaging",
-        "temperature_alignment", "alignment_drift", "channel_alignment",
+        "temperature_alignment", "alignment_drift", "channel_alignment", "channel_rate",
     },
     "site": {"fixed_source", "site_gradient", "passing_source"},
     "reference": {"reference_scale", "reference_clock", "reference_drift", "reference_step", "reference_while"},

@@ -30,7 +30,7 @@ import magtensor_effects
 from magtensor.components import Component, component_of
 from magtensor.error_models.excitation import Excitation
 from magtensor.simulate.run import Simulated
-from magtensor_effects.mechanics import LOAD
+from magtensor_effects.channels import OTHER
 
 SPAN_S = 179.9  # of the tumbling survey
 START_S = 1.0  # the simulator begins at rest: rates are not the steady motion's before
@@ -310,12 +310,12 @@ def test_a_boom_that_bends_under_load_in_arcmin_per_unit() -> None:
     assert set(magtensor_effects.channel_alignment(x, channel="pressure").units) == {"arcmin/hPa"}
 
 
-def test_a_boom_bends_under_any_channel_but_temperatures_and_angles() -> None:
+def test_a_load_is_any_channel_but_temperatures_and_angles() -> None:
     x = excitation(simulated("temperature_offset", nT_per_degC=[0.0, 0.0, 0.0]))
     course = np.linspace(0.0, 1.0, len(x.time))
     named = {"winch_load": "kN", "heading": "deg", "temperature_1": "degC", "board": "K", "strain": "", "force": "N"}
     logged = {name: np.repeat(course[:, None], 3, axis=1) if name == "force" else course for name in named}
-    assert LOAD.values(replace(x, logged=logged, units=named)) == ["strain", "winch_load"]
+    assert OTHER.values(replace(x, logged=logged, units=named)) == ["strain", "winch_load"]
 
 
 def test_a_mount_that_creeps_in_arcmin() -> None:
@@ -385,6 +385,34 @@ def test_channel_response(settings: dict[str, Any], units: str) -> None:
     true = truth_of(survey)
     np.testing.assert_allclose(per_axis(fit, survey.sensors), true, atol=0.02 * np.abs(true).max())
     assert set(magtensor_effects.channel_response(x, channel="pressure", **settings).units) == {units}
+
+
+@pytest.mark.parametrize(
+    ("channel", "units", "tau_s"), [("pressure", "nT s/hPa", 3.0), ("current_pump", "nT s/A", 2.0)]
+)
+def test_channel_rate(channel: str, units: str, tau_s: float) -> None:
+    """Of what goes smoothly, and of what is switched."""
+    effect = {"nT_per_unit": drawn(2), "channel": channel, "tau_s": tau_s}
+    fit, survey, x = fitted("channel_rate", {"channel": channel, "lag_s": tau_s}, effect)
+    assert fit.left < 0.01
+    true = tau_s * truth_of(survey)
+    np.testing.assert_allclose(per_axis(fit, survey.sensors), true, atol=0.02 * np.abs(true).max())
+    assert set(magtensor_effects.channel_rate(x, channel=channel).units) == {units}
+
+
+def test_the_rate_of_a_slow_channel() -> None:
+    """The derivative, through lags shorter than the time between samples too, and across a gap."""
+    x = excitation(simulated("warm_up", nT=[1.0, 1.0, 1.0]))
+    part = x.at(np.flatnonzero((x.elapsed < 60.0) | (x.elapsed > 75.0)))
+    slow = 3.0 * np.sin(2.0 * np.pi * part.elapsed / 8.0)
+    slowly = replace(part, part_of=None, logged={"flow": slow}, units={"flow": "l/s"})
+    w = 2.0 * np.pi / 8.0
+    settled = ((slowly.elapsed > 5.0) & (slowly.elapsed < 59.5)) | (slowly.elapsed > 80.0)
+    settled[-1] = False  # known from one side
+    for lag in (0.0, 0.01, 0.05, 0.2, 0.7):
+        found = magtensor_effects.channel_rate(slowly, channel="flow", lag_s=lag).series[:, 0]
+        lagged = 3.0 * w * np.real(np.exp(1j * w * slowly.elapsed) / (1.0 + 1j * w * lag))
+        np.testing.assert_allclose(found[settled], lagged[settled], atol=2e-3 * 3.0 * w)
 
 
 def test_latent_source() -> None:

@@ -54,6 +54,7 @@ EVERY: dict[str, dict[str, Any]] = {
     "periodic_interference": {"frequency_Hz": 49.7, "harmonics": [0.3]},
     "frame_flexure": {},
     "channel_response": {"channel": "pressure", "power": 2, "lag_s": 3.0, "times_field": True},
+    "channel_rate": {"channel": "pressure", "tau_s": 3.0},
     "latent_source": {"waveform_of": {"type": "switched", "mean_hold_s": 7.0}},
     "jitter": {},
     "position_error": {},

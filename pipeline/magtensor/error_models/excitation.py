@@ -166,6 +166,22 @@ class Excitation(Acting):
             return seen
         return seen + self.dying(lag_s, at_start).reshape(-1, *[1] * (seen.ndim - 1))
 
+    def rate_of(self, name: str, lag_s: float = 0.0, smooth: bool = False, at_start: float = 0.0) -> Array:
+        """How fast a logged channel changes, (N,), (N, S) or (N, 3) in its units/s, seen through a first-order lag;
+        `smooth` and `at_start` as in `channel`.
+
+        Raises:
+            KeyError: there is none of that name.
+        """
+
+        def made(x: Excitation) -> Array:
+            return first_order.rate(x.time, x._without_noise(name) if smooth else x.channel(name), lag_s)
+
+        rate = self._kept(("rate", name, lag_s, smooth), made)
+        if lag_s <= 0:
+            return rate
+        return rate - self.dying(lag_s, at_start).reshape(-1, *[1] * (rate.ndim - 1)) / lag_s
+
     def dying(self, tau: float, at_start: float) -> Array:
         """(N,) what is left of what a first-order lag tau, s, was out of equilibrium by when the survey began; none
         where that is not known."""

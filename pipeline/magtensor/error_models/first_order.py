@@ -10,6 +10,7 @@ from magtensor.calibration.types import Array
 
 _SERIES_BELOW = 1.0  # sampling intervals in units of tau: below, the recurrence for the moments loses digits
 _SERIES_TERMS = 20
+_GAP = 3.0  # times the usual interval
 
 
 def straight(time: Array, series: Array, tau: float) -> Array:
@@ -31,11 +32,29 @@ def smooth(time: Array, series: Array, tau: float) -> Array:
     """
     from scipy.interpolate import CubicSpline
 
+    return _to_cubics(time, series, CubicSpline(time, series).c, tau)
+
+
+def rate(time: Array, series: Array, tau: float) -> Array:
+    """(N, ...) how fast a series changes, 1/s, seen through a lag: (x - y) / tau; x' for a tau of 0.
+
+    Between its samples the series is a cubic with the central differences for its slopes, across a gap it is straight:
+    straight everywhere, it would be late by half an interval where tau is short.
+    """
+    if len(time) < 2:
+        return np.zeros_like(series, dtype=float)
+    slopes: Array = np.gradient(series, time, axis=0)
+    if tau <= 0:
+        return slopes
+    from scipy.interpolate import CubicHermiteSpline
+
     step = np.diff(time)
-    coefficients = CubicSpline(time, series).c  # of falling powers, (4, N - 1, ...)
-    weights = _moments(step / tau) * step ** np.arange(4)[:, None]
-    driven = sum(w.reshape(-1, *[1] * (series.ndim - 1)) * c for w, c in zip(weights, coefficients[::-1], strict=True))
-    return _recursion(np.concatenate([[1.0], np.exp(-step / tau)]), np.concatenate([series[:1], driven]))
+    cubics = CubicHermiteSpline(time, series, slopes).c
+    gaps = step > _GAP * np.median(step)
+    cubics[:2, gaps] = 0.0
+    cubics[2, gaps] = (np.diff(series, axis=0) / step.reshape(-1, *[1] * (series.ndim - 1)))[gaps]
+    found: Array = (series - _to_cubics(time, series, cubics, tau)) / tau
+    return found
 
 
 def undone(time: Array, series: Array, tau: float) -> Array:
@@ -55,6 +74,14 @@ def ahead(time: Array, series: Array, lead: float) -> Array:
     slopes = (flat[-1] - flat[-2]) / (time[-1] - time[-2])
     moved = np.column_stack([np.interp(time + lead, time, column) for column in flat.T]) + np.outer(beyond, slopes)
     return moved.reshape(series.shape)
+
+
+def _to_cubics(time: Array, series: Array, coefficients: Array, tau: float) -> Array:
+    """(N, ...) the response to a piecewise cubic (4, N - 1, ...) of falling powers, y starting at x[0]."""
+    step = np.diff(time)
+    weights = _moments(step / tau) * step ** np.arange(4)[:, None]
+    driven = sum(w.reshape(-1, *[1] * (series.ndim - 1)) * c for w, c in zip(weights, coefficients[::-1], strict=True))
+    return _recursion(np.concatenate([[1.0], np.exp(-step / tau)]), np.concatenate([series[:1], driven]))
 
 
 def _moments(a: Array) -> Array:

@@ -239,7 +239,7 @@ CHANNEL = "channel_response"  # of a channel that nobody wrote a model for
 
 def generic(model: Adopted) -> bool:
     """A model of anything that follows a channel says less than one that names a cause."""
-    return model.name in (CHANNEL, "latent_source")
+    return model.name in (CHANNEL, "channel_rate", "latent_source")
 
 
 def of_the_site(component: Component) -> bool:

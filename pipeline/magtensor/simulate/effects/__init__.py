@@ -21,6 +21,7 @@ from magtensor.simulate.effects.platform import (
     AlignmentDrift,
     CalibrationStep,
     ChannelAlignment,
+    ChannelRate,
     ChannelResponse,
     Crosstalk,
     CurrentField,
@@ -63,6 +64,7 @@ AnyEffect = Annotated[
     | SupplyOffset
     | CurrentField
     | ChannelResponse
+    | ChannelRate
     | LatentSource
     | MovingPart
     | PeriodicInterference

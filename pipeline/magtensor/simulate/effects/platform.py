@@ -85,6 +85,22 @@ class ChannelResponse(SensorEffectSpec):
         return bench.sensed(bench.b) * (1e-6 * coefficients) * course if self.times_field else course * coefficients
 
 
+class ChannelRate(SensorEffectSpec):
+    """The output answers to a change of a channel and forgets it, as through a capacitor into a resistor."""
+
+    COEFFICIENTS = "nT_per_unit"
+    type: Literal["channel_rate"]
+    nT_per_unit: PerSensor | None = Field(
+        None, description="x, y, z per channel unit by which it jumps, for all sensors or for each"
+    )
+    channel: str = Field(description="channel")
+    tau_s: float = Field(10.0, gt=0, description="time constant with which it forgets, s")
+
+    def waveform(self, bench: Bench, coefficients: Array) -> Array:
+        across_capacitor = bench.lagged_channel(self.channel, self.tau_s, self.name)
+        return (bench.channel(self.channel, self.name) - across_capacitor)[..., None] * coefficients
+
+
 class LatentSource(SensorEffectSpec):
     """A magnetic source on the platform that nobody logged: one waveform, one vector at each sensor."""
 
