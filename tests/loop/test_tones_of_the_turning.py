@@ -177,3 +177,16 @@ def test_a_tone_of_few_periods_is_found(seed: int, tmp_path: Path) -> None:
     assert tone["error_model"] == "periodic_interference"
     assert tone["settings"]["frequency_Hz"] == pytest.approx(frequency, abs=0.1 / 1200.0)
     assert not told["unexplained"]["present"], told["unexplained"]["description"]
+
+
+@pytest.mark.parametrize("sensors", [1, 4])
+def test_the_strongest_line_of_noise_is_not_looked_at_as_a_tone(sensors: int) -> None:
+    """The largest of a thousand frequencies, a single test by blocks of which would be passed by one survey in four."""
+    proposed = [
+        tones(linear_state(r), r.time) for r in (synthetic(seed, sensors=sensors, turning_s=4.0) for seed in range(20))
+    ]
+    assert sum(bool(found) for found in proposed) <= 1  # a chance of 0.005 each: two in one case of 200
+    t = np.arange(1200.0)
+    tone = np.sin(2.0 * np.pi * 0.2137 * t)[:, None, None] * np.array([1.0, -0.5, 0.7])
+    heard = synthetic(1, sensors=sensors, turning_s=4.0, added=np.repeat(tone, sensors, axis=1))
+    assert tones(linear_state(heard), heard.time)[0] == pytest.approx(0.2137, abs=1e-3)

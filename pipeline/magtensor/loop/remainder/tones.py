@@ -18,13 +18,16 @@ from magtensor.loop.evidence.spectrum import spectral_lines
 from magtensor.loop.fitting.model import State
 
 MOST = 5  # lines that are looked for tones at
+CHANCE = 0.005  # probability that the strongest line of noise is taken for one
 HARMONICS = 5  # powers of a channel, whose lines its own law may have: a saturation has odd ones
 LARGEST_LAW = 0.01  # of the field, that a law of the attitude makes of an attitude's line
 
 
 def tones(state: State, time: Array) -> tuple[float, ...]:
-    """Hz of the strongest lines that are no more than likely the turning's, `time` being that of all samples."""
+    """Hz of the strongest lines that noise does not make and that are no more than likely the turning's, `time` being
+    that of all samples. No test of a tone by itself would know that it was taken from a thousand frequencies."""
     lines = spectral_lines(state.residual, time[state.residual.samples], most=2 * MOST)
+    lines = [line for line in lines if line[2] < CHANCE]
     theirs = of_the_turning(state.excitation, [f for f, _, _ in lines], [rms for _, rms, _ in lines])
     return tuple(f for (f, _, _), its in zip(lines, theirs, strict=True) if not its)[:MOST]
 
