@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -84,3 +85,17 @@ def test_what_holds_an_event_and_more_is_no_next_order_of_it(model: str, holds: 
     rest = by_hand.candidate(component, {"time_s": 701.0}, state, 30, ALPHA)
     large = kin.explained_beside(state, Adopted(component, {"time_s": 701.0}), rest.terms, rest.assessment)
     assert large == 0.0 if holds else large > 1e6
+
+
+def test_sensors_that_differ_by_five_per_cent_are_calibrated_to_their_noise() -> None:
+    """What they show more after they have changed places is known once C is, and C once that is taken off."""
+    record = synthetic(5, noise_nT=0.1, turning_s=4.0)
+    rng = np.random.default_rng(5)
+    loose = np.eye(3) + 0.05 * rng.standard_normal((4, 3, 3))
+    raw = np.einsum("sij,nsj->nsi", loose, record.raw) + 300.0 * rng.standard_normal((4, 3))
+    raw[700:] = exchanged(raw[700:])
+    record = replace(record, raw=raw)
+    step = Adopted(Registry.load().find("error_model", "calibration_step"), {"time_s": 700.0}, ("S2", "S3"))
+    state = joint_state(record, [step], Fitting())
+    # 1200 samples of white noise: the mean square is 1 within 2 %
+    assert state.residual.square() == pytest.approx(1.0, abs=0.06), state.residual.square()

@@ -62,6 +62,7 @@ def joint_state(
     estimate: Estimate | None = None
     terms: Terms | None = None
     fit: JointFit | None = None
+    residual: Residual | None = None
     for round_ in range(MOST_ROUNDS):
         # what attitudes can determine nobody asks between the first fit and the last
         known = None if fit is None or round_ + 1 == MOST_ROUNDS else fit.coverage
@@ -75,8 +76,11 @@ def joint_state(
         each = [a.terms(x) for a in adopted]
         if round_ == 0:
             theta = [t if len(t) == e.count else np.zeros(e.count) for t, e in zip(theta, each, strict=True)]
-            if any(t.any() for t in theta):
-                raw, reference = without(record, each, theta)
+        if any(t.any() for t in theta):
+            # the coefficients are to be of these regressors, not of those that an earlier fit has made
+            before_this = raw
+            raw, reference = without(record, each, theta)
+            if residual is None or _moved(raw - before_this, residual):
                 fit = _fit(record, adopted, raw, reference, how, keep, start=fit)
                 x = beside_the_site(excitation_of(record, fit, raw, lines, seen), adopted, theta)
                 each = [a.terms(x) for a in adopted]
@@ -91,7 +95,7 @@ def joint_state(
         after = shown + move_of(residual, terms, estimate, colours, fresh=not before.any())
         theta = np.split(after, edges)
         raw, reference = without(record, each, theta)
-        if small(after - before, estimate):
+        if small(after - before, estimate) or round_ + 1 == MOST_ROUNDS:
             fit = _fit(record, adopted, raw, reference, how, keep, start=fit)
             x = beside_the_site(excitation_of(record, fit, raw, lines, seen), adopted, theta)
             break
@@ -212,6 +216,12 @@ def small(step: Array, estimate: Estimate) -> bool:
     """Whether a step (P,) is one that the data hardly see."""
     deviations = np.sqrt(np.maximum(np.diag(estimate.covariance), 1e-300))
     return bool(np.max(np.abs(step) / deviations, initial=0.0) < SETTLED)
+
+
+def _moved(change: Array, residual: Residual) -> bool:
+    """Whether a change of the outputs (N, S, 3), nT, shows beside their noise."""
+    rms = np.sqrt(np.mean(change**2, axis=0)).ravel()
+    return bool(np.any(rms > SETTLED * residual.noise))
 
 
 def _fit(
