@@ -202,9 +202,10 @@ def _disagreement(outcome: dict[str, Any]) -> str:
             "the first shows too little of what the second needs"
         )
     if left > DISAGREES * here["all"]:
+        too = ", or what is unexplained here too" if outcome["unexplained"]["present"] else ""
         words += (
             f"; the verification survey has {figure(left)} nT rms of |b| - F{where} that no calibration would take "
-            "off: noise or disturbances of its own"
+            f"off: noise or disturbances of its own{too}"
         )
     return words
 

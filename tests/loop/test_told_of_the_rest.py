@@ -278,7 +278,7 @@ def test_where_another_survey_disagrees_is_told(left: float, each: dict[str, flo
         return {"total_field_rms_nT": {**each, "all": rms}, "tensor_rms_nT_per_m": None}
 
     here, there = block({"S1": 0.16, "S2": 0.16}), block(each)
-    said = sentence({
+    outcome = {
         "declared": ["linear"],
         "adopted": [],
         "noise_floor_nT": 0.15,
@@ -288,8 +288,12 @@ def test_where_another_survey_disagrees_is_told(left: float, each: dict[str, flo
             "held_out": {"before": here, "after": here},
             "verify": {"before": there, "after": there, "left_by_any_calibration_nT": left},
         },
-    })  # fmt: skip
+    }  # fmt: skip
+    said = sentence(outcome)
     assert changed in said and own in said
+    assert "unexplained here too" not in said
+    rest = {"present": True, "description": "something", "excess_rms_nT": 0.0, "looks_like": []}
+    assert ("or what is unexplained here too" in sentence(outcome | {"unexplained": rest})) is bool(own)
     assert ("disagrees" in said) is bool(changed) and ("no calibration" in said) is bool(own)
 
 
