@@ -78,7 +78,7 @@ def close_loop(
     from magtensor.loop.fitting.model import Fitting, unread
     from magtensor.loop.inquiry import inquiry_of
     from magtensor.loop.near_nominal import doubt_of, labelled, settled
-    from magtensor.loop.remainder.excess import white_noise
+    from magtensor.loop.remainder.excess import noise_floor
     from magtensor.loop.searching.unexplained import unexplained
     from magtensor.tensors import slow_noise_variables
 
@@ -128,7 +128,7 @@ def close_loop(
         calibration = labelled(calibration, doubt)
     outcome = {
         "declared": ["linear", *(a.name for a in begin)],
-        "noise_floor_nT": white_noise(found.told.residual),
+        "noise_floor_nT": noise_floor(found.told.residual, all_noise=not left["present"]),
     } | inquiry.told(found)
     outcome |= {"unexplained": left, "held_out": {"before": before, "after": after}}
     if doubt is not None:

@@ -9,6 +9,7 @@ import numpy as np
 from magtensor.calibration.types import Array
 from magtensor.loop.evidence.residual import Residual
 from magtensor.loop.fitting.model import State
+from magtensor.loop.remainder.limited_band import limited_band
 
 FAR_MORE = 4.0  # times the square that noise would leave
 TIMES = 4  # that differences are taken, from one sample to the next
@@ -40,6 +41,12 @@ def white_noise(residual: Residual) -> float:
     fast = np.diff(across, n=TIMES, axis=0)
     level = float(np.mean(np.median(fast**2, axis=0))) / (MEDIAN * comb(2 * TIMES, TIMES))
     return residual.scale * float(np.sqrt(min(level / one, 1.0)))
+
+
+def noise_floor(residual: Residual, *, all_noise: bool) -> float:
+    """nT, as `white_noise`; where all that is left is noise, that of the band that a filter has left of it."""
+    band = limited_band(residual) if all_noise else None
+    return white_noise(residual) if band is None else band.rms_nT
 
 
 def _of_outputs(shown: Array, above: Array, residual: Residual) -> float:

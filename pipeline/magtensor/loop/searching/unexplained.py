@@ -30,6 +30,7 @@ from magtensor.loop.remainder.flagged import (
 )
 from magtensor.loop.remainder.gradient_shape import MODEL, gradient_share
 from magtensor.loop.remainder.jitter import jitter_words
+from magtensor.loop.remainder.limited_band import Band, limited_band
 from magtensor.loop.remainder.loud import Loud
 from magtensor.loop.remainder.outlying import Outlying, outlying_words, spike_words
 from magtensor.loop.remainder.predictable import attitude_words, converter_words, shortened_words
@@ -63,12 +64,15 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
     outlying = Outlying.of(state, record)
     too_often, theirs = outlying_words(outlying, ~np.asarray(state.fit.keep))
     words = [*_what_shows(found, record, excess, sparse), *suspects.words, *too_often]
+    band = None if words else limited_band(state.residual)
     times = _slow(state, record) / state.residual.scale
-    if not words and times > NO_NOISE:
+    if not words and (times if band is None else band.slow) > NO_NOISE:
         words.append(
             f"it is slow, and {times:.2g} times the white noise, where noise with a power of 1/f has three at most: "
             "what moved there follows nothing that is logged"
         )
+    elif band is not None:
+        excess = max(excess**2 + state.residual.scale**2 - band.rms_nT**2, 0.0) ** 0.5
     beside = [*loud.words, *unread_words(state, record)]
     gradient = gradient_share(state, record.position)
     shaped = bool(words) and gradient > 0
@@ -95,7 +99,7 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
     return {
         "present": present,
         "excess_rms_nT": excess,
-        "description": "; ".join([*(words if present else noise_words(state, record)), *beside]),
+        "description": "; ".join([*(words if present else noise_words(state, record, band)), *beside]),
         "looks_like": untested + suspects.nearest if present else [],
     }
 
@@ -144,9 +148,12 @@ def _what_shows(found: Search, record: Record, excess: float, sparse: SparseRead
     return words
 
 
-def noise_words(state: State, record: Record) -> list[str]:
+def noise_words(state: State, record: Record, band: Band | None) -> list[str]:
     """What is left where nothing is unexplained, and what of it is not white where that is more than what is."""
     residual, white, words = state.residual, state.residual.scale, [NOISE]
+    if band is not None:
+        highest = band.part / (2.0 * state.excitation.spacing)
+        return [f"what is left is noise of a limited band, as behind a filter: up to {highest:.2g} Hz"]
     if residual.across is not None:
         slow = slow_across(residual)
         if slow > white:
