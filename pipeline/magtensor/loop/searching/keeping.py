@@ -9,8 +9,10 @@ from magtensor.error_models.excitation import Excitation
 from magtensor.error_models.settings import Range, profiled
 from magtensor.errors import DataError
 from magtensor.loop.fitting.model import Adopted, Fitting, Record, State
+from magtensor.loop.fitting.refit import joint_state
 from magtensor.loop.fitting.separation import SEPARATION, fold_gain
 from magtensor.loop.fitting.trial import Trial, on_the_folds_of, trial
+from magtensor.loop.fitting.wandering import all_noise
 from magtensor.loop.remainder.changing_matrix import channel_instead
 from magtensor.loop.remainder.curve_of_a_channel import event_of_a_curve
 from magtensor.loop.searching.adopting import adopt, on_all_sensors, polished
@@ -41,6 +43,7 @@ MAYBE_HEAT = (
     "fitted, it goes with one direction of the lagged field: what the sun, or an engine, warms on one side would look "
     "the same"
 )
+LITTLE = 0.1  # of the error of a sensor: what a law leaves that is another one leaves more
 UNEARNED = "fitted, it does not earn its place on held-out blocks"
 
 
@@ -77,9 +80,27 @@ def fitted(record: Record, before: Trial, chosen: Candidate, how: Fitting) -> Fi
                 if not missed_on(fewer.state, which, hurt):
                     after = fewer
                 hurt = []
+            elif _of_what_it_leaves(record, before, fewer, which, how):
+                after, hurt = fewer, []
     if hurt:
         return Fitted(after, f"fitted, it raises the held-out error of {', '.join(hurt)}", tuple(hurt))
     return Fitted(after, why_not(record, before, after, chosen, how))
+
+
+def _of_what_it_leaves(record: Record, before: Trial, after: Trial, which: int, how: Fitting) -> bool:
+    """Whether the sensors that a model does not act on are hurt only by the little that it leaves of a large error on
+    those that it acts on: that is no noise, and hurts them no longer where each sensor is weighed by all it has."""
+    was, left = before.beside(after)
+    own = after.state.adopted[which].sensors
+    if not own or any(left[s] > LITTLE * was[s] for s in own):
+        return False
+    how = replace(how, noise=all_noise(after.state))
+    try:
+        weighed = joint_state(record, after.state.adopted, how, after.state.theta, after.state.lines)
+        again = trial(record, weighed, how)
+    except DataError:
+        return False
+    return not on_the_folds_of(again, record, before, how).hurt_by(again)
 
 
 def missed_on(state: State, which: int, sensors: Sequence[str]) -> bool:
