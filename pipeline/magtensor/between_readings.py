@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from itertools import pairwise
 from typing import Literal, get_args
 
 import numpy as np
@@ -25,9 +26,11 @@ LEAST_READINGS = 60  # fewer do not tell two courses apart
 BLOCKS = 10  # of the record: a course that predicts better does so in most of them
 MOST = 0.8  # of the blocks
 BETTER = 0.8  # of the squared error: what a spline gains by less it loses where noise passes through it
+GAP = 2.5  # median steps: what goes on before it says nothing of what goes on behind it
 UNEVEN = 1.5  # median steps: a longer one is bridged by the monotone cubic
 ABRUPT = 8.0  # times the usual difference between a change and those beside it: a step or a spike
 BESIDE = 3  # readings to each side of a break, which say nothing of a course
+LEAST_CHANGES = 5  # beside each other, to tell one that is abrupt
 LEAST_PIECE = 6  # readings between two breaks that a spline goes through
 
 
@@ -91,14 +94,32 @@ def breaks(time: Floats, values: Floats) -> Bools:
         time: (N,) s, increasing; values: (N,).
     """
     steps, changes = np.diff(time), np.diff(values)
-    if len(changes) < 5:
-        return np.ones(len(changes), dtype=bool)
-    padded = np.pad(changes, 2, mode="reflect")
-    beside = np.stack([padded[k : k + len(changes)] for k in (0, 1, 3, 4)])
-    off = np.abs(changes - np.median(beside, axis=0))
-    usual = np.sqrt(np.mean(np.sort(off**2)[: -(-len(off) * 9 // 10)]))
-    out: Bools = (off > ABRUPT * usual) | (steps > UNEVEN * np.median(steps))
+    off, bent, told = np.zeros(len(changes)), np.zeros(len(changes)), np.zeros(len(changes), dtype=bool)
+    for piece in without_a_gap(time):
+        own = slice(piece.start, piece.stop - 1)
+        if own.stop - own.start < LEAST_CHANGES:
+            continue
+        padded = np.pad(changes[own], 2, mode="reflect")
+        beside = np.stack([padded[k : k + own.stop - own.start] for k in (0, 1, 3, 4)])
+        off[own], told[own] = np.abs(changes[own] - np.median(beside, axis=0)), True
+        bend = np.abs(np.diff(changes[own], n=2))  # at the ends beyond the line through the two before
+        bent[own] = np.concatenate([bend[:1], bend / 2.0, bend[-1:]])
+    if not told.any():
+        return ~told
+    usual = np.sqrt(np.mean(np.sort(off[told] ** 2)[: -(-told.sum() * 9 // 10)]))
+    out: Bools = (np.minimum(off, bent) > ABRUPT * usual) | (steps > UNEVEN * np.median(steps)) | ~told
     return out
+
+
+def without_a_gap(time: Floats) -> list[slice]:
+    """The readings between two gaps, from the first to one past the last.
+
+    Args:
+        time: (N,) s, increasing.
+    """
+    steps = np.diff(time)
+    ends = np.flatnonzero(steps > GAP * np.median(steps)) + 1 if len(steps) else np.zeros(0, dtype=int)
+    return [slice(int(a), int(b)) for a, b in pairwise([0, *ends, len(time)])]
 
 
 def noise_gain(how: Course, place: Floats) -> Floats:

@@ -71,7 +71,7 @@ def detrend_diurnal(
         raise DataError("its times do not increase", where=where, hint="the stage `load` can drop such samples")
     flags: list[Flag] = []
     if despike is not None and len(values) > reference.SPIKE_WINDOW:
-        bad = reference.spikes(values, despike)
+        bad = reference.spikes(values, despike, time)
         flags += flag_ranges(time, bad, by=BY, reason="spike in the reference", sensor="reference")
         time, values = time[~bad], values[~bad]
     origin = str(record.attrs.get("origin", "measured"))

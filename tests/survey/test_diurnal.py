@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from survey_cases import START, array_variables
 
-from magtensor.between_readings import Course
+from magtensor.between_readings import Course, breaks, course
 from magtensor.errors import DataError
 from magtensor.survey.model import Survey
 from magtensor.survey.reference import noise, sample, spikes
@@ -226,3 +226,29 @@ def test_a_spike_near_larger_ones_is_one(seed: int) -> None:
     values = 49_000.0 + 0.1 * np.random.default_rng(seed).standard_normal(420) + np.sin(np.arange(420) / 40.0)
     values[places] += [7.9, 20.0, 20.0, 7.9]
     assert np.flatnonzero(spikes(values, 8.0)).tolist() == places.tolist()
+
+
+def test_a_storm_with_a_gap_is_followed_to_both_sides_of_it() -> None:
+    """The field went on during the gap: its far side is no neighbour of its near one, by which good readings would be
+    spikes, or steps; a spike near it is one."""
+    at = np.concatenate([np.arange(-100.0, 360.0, 5.0), np.arange(500.0, 1000.0, 5.0)])
+
+    def storm(time: np.ndarray) -> np.ndarray:
+        return 50_000 + 70.0 * np.sin(time / 40.0) + 40.0 * np.sin(time / 90.0)
+
+    record = storm(at) + 0.02 * np.random.default_rng(8).standard_normal(len(at))
+    assert not spikes(record, 8.0, at).any()
+    spiky = record.copy()
+    spiky[[89, 94]] += [5.0, -5.0]  # third from the gap on either side
+    assert np.flatnonzero(spikes(spiky, 8.0, at)).tolist() == [89, 94]
+    assert at[:-1][breaks(at, record)].tolist() == [355.0]
+    near = np.concatenate([np.arange(330.0, 355.0, 0.1), np.arange(500.0, 525.0, 0.1)])
+    off = course(at, record, "spline")(near) - storm(near)
+    assert np.abs(off).max() < 0.12  # noise of 0.02 nT, and the ends of a spline
+
+
+def test_a_step_in_the_last_interval_before_a_gap_is_one() -> None:
+    at = np.concatenate([np.arange(50.0), np.arange(80.0, 130.0)])
+    record = 0.02 * np.random.default_rng(9).standard_normal(100)
+    record[49] += 5.0
+    assert breaks(at, record)[48:50].all()

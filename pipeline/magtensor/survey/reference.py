@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from magtensor.between_readings import Course, course, noise_gain
+from magtensor.between_readings import Course, course, noise_gain, without_a_gap
 from magtensor.survey.recorded_numbers import resolution
 
 Floats = NDArray[np.float64]
@@ -17,6 +18,7 @@ ENDS = 4  # samples whose line a record goes on along: of two it would be mostly
 SPIKE_WINDOW = 7  # samples; three good neighbours on each side outvote a spike of up to three samples
 SPIKE_ALONE = 0.7  # of its deviation from the cubic: both are the spike's height, and half a step's from the cubic
 LEFT_BESIDE = 0.25  # of its deviation from the cubic: a lone spike leaves nothing at its neighbours, a step a third
+CUBIC = np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / 6.0  # what the middle one of five leaves the cubic of the others by
 SPIKE_ROUNDS = 4  # in which spikes are looked for, the ones found taken out
 SPIKE_SURROUNDINGS = 61  # samples that tell what is usual where the field is active
 
@@ -77,7 +79,7 @@ def sample(at: Floats, time: Floats, values: Floats, *, how: Course, max_gap_s: 
     return Sampled(np.where(covered, found, np.nan), covered, norm)
 
 
-def spikes(values: Floats, threshold: float) -> Bools:
+def spikes(values: Floats, threshold: float, time: Floats | None = None) -> Bools:
     """(N,) True where a sample leaves the cubic through its neighbours by more than `threshold` robust standard
     deviations, and is a spike and no step: either its neighbours would lie on their cubics if it lay on its own, or it
     leaves the running median as well, as up to three samples beside each other do.
@@ -86,54 +88,81 @@ def spikes(values: Floats, threshold: float) -> Bools:
     so where the record is steep. Each deviation's scale is 1.4826 times its median magnitude over the whole record, or
     what the upper quartile of the magnitudes around the sample would be the scale of, if that is larger; and at least
     the record's resolution: a proton magnetometer that rounds to 0.1 nT repeats itself for long. Where spikes are
-    found it is asked once more without them, for a few of them make a quiet record seem active around them.
+    found it is asked once more without them, for a few of them make a quiet record seem active around them. Samples on
+    the two sides of a gap are no neighbours. The last two before one, and of the record, are spikes by the
+    median alone: a steep record may end there.
 
     Args:
         values: (N,) finite.
         threshold: standard deviations.
+        time: (N,) s, which tells gaps; None: there are none.
     """
-    least, place = resolution(values), np.arange(len(values))
-    found = np.zeros(len(values), dtype=bool)
+    least, found = resolution(values), np.zeros(len(values), dtype=bool)
+    pieces = [slice(0, len(values))] if time is None else without_a_gap(time)
     for _ in range(SPIKE_ROUNDS):
-        without = np.interp(place, place[~found], values[~found]) if found.any() else values
-        more = _spikes_among(without, threshold, least) & ~found
+        without = np.concatenate([_bridged(values[p], found[p]) for p in pieces])
+        more = _spikes_among(without, pieces, threshold, least) & ~found
         if not more.any() or (found | more).all():
             break
         found |= more
     return found
 
 
-def _spikes_among(values: Floats, threshold: float, least: float) -> Bools:
-    """(N,) those that stand out as they are, `least` being the record's resolution."""
-    from scipy.ndimage import correlate1d, median_filter
+def _bridged(values: Floats, bad: Bools) -> Floats:
+    """(N,) values without those that are bad, straight from good to good."""
+    if not bad.any() or bad.all():
+        return values
+    place = np.arange(len(values))
+    out: Floats = np.interp(place, place[~bad], values[~bad])
+    return out
 
-    strays = correlate1d(values, np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / 6.0, mode="nearest")
+
+def _spikes_among(values: Floats, pieces: list[slice], threshold: float, least: float) -> Bools:
+    """(N,) those that stand out as they are, `least` being the record's resolution."""
+    from scipy.ndimage import median_filter
+
+    def by_piece(what: Callable[[Floats], Floats], of: Floats) -> Floats:
+        return np.concatenate([what(of[p]) for p in pieces])
+
+    strays = by_piece(_strays, values)
     rough = np.abs(strays)
-    astray = rough > threshold * _scale(rough, least)
-    alone = astray & (_left_beside(strays) < LEFT_BESIDE * rough)
-    off = np.abs(values - median_filter(values, SPIKE_WINDOW, mode="nearest"))
+    limit = threshold * _scale(rough, least)
+    astray = rough > limit
+    alone = astray & (by_piece(_left_beside, strays) < LEFT_BESIDE * rough)
+    off = np.abs(values - by_piece(lambda v: median_filter(v, SPIKE_WINDOW, mode="nearest"), values))
     limit = threshold * _scale(off, least)
     several = astray & (off > limit) & (off > SPIKE_ALONE * rough)
-    if several.any() and not several.all():
-        # Beside a spike the running median steps aside on a steep record; what lies on the line between good
-        # neighbours is good.
-        place = np.arange(len(values))
-        several &= np.abs(values - np.interp(place, place[~several], values[~several])) > limit
-    else:
-        several[:] = False
+    # Beside a spike the running median steps aside on a steep record; what lies on the line between good neighbours
+    # is good.
+    for piece in pieces:
+        some = several[piece]
+        several[piece] &= np.abs(values[piece] - _bridged(values[piece], some)) > limit[piece]
     return alone | several
+
+
+def _strays(values: Floats) -> Floats:
+    """(N,) by how much each leaves the cubic through the two on either side; of the first and the last two what the one
+    beside them does, which they have a share in; 0 of fewer than five."""
+    if len(values) < len(CUBIC):
+        return np.zeros(len(values))
+    out: Floats = np.pad(np.convolve(values, CUBIC, mode="valid"), 2)
+    fourth = out * CUBIC[0]
+    out[:2], out[-2:] = fourth[2], fourth[-3]
+    return out
 
 
 def _left_beside(strays: Floats) -> Floats:
     """(N,) the largest of the deviations from the cubic (N,) of the two neighbours on each side, if the sample itself
-    lay on it: those beside a spike come from it alone."""
+    lay on it: those beside a spike come from it alone. Of the first and the last two it is not known."""
     n = len(strays)
-    padded = np.pad(strays, 2)
+    out = np.full(n, np.inf)
+    padded = np.pad(strays[2:-2], 4, constant_values=np.nan)
     each = [
         padded[2 + k : 2 + k + n] + share * strays for k, share in ((-2, -1 / 6), (-1, 2 / 3), (1, 2 / 3), (2, -1 / 6))
     ]
-    found: Floats = np.max(np.abs(each), axis=0)
-    return found
+    if n > len(CUBIC):
+        out[2:-2] = np.nanmax(np.abs(each), axis=0)[2:-2]
+    return out
 
 
 def _scale(deviation: Floats, least: float) -> Floats:

@@ -155,7 +155,7 @@ def _station(survey: Survey) -> Station | None:
     at, values = at[known], values[known]
     made = survey["total_field"].attrs
     if "despike" in made:
-        good = ~spikes(values, float(made["despike"]))
+        good = ~spikes(values, float(made["despike"]), at)
         at, values = at[good], values[good]
     at = at - float(made.get("latency_s", 0.0))
     how = made.get("interpolation")
