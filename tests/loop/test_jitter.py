@@ -37,6 +37,22 @@ def test_nothing_else_is_taken_for_it(what: str, seed: int, tmp_path: Path) -> N
     assert jitter_words(linear_state(loaded(tmp_path, scenario(seed, *EFFECTS[what])))) == []
 
 
+@pytest.mark.parametrize("seed", [3, 4])
+def test_noise_that_is_nearly_all_slow_has_no_scatter(seed: int, tmp_path: Path) -> None:
+    """A random walk of 0.3 nT beside white noise of 0.005: what turns it makes some of that grow with the turning."""
+
+    def wandering(path: Path) -> None:
+        with h5py.File(path, "r+") as survey:
+            raw = survey["b_raw"]
+            walk = np.cumsum(np.random.default_rng(seed).standard_normal(raw.shape), axis=0)
+            raw[...] = raw[:] + 0.3 * walk / walk.std()
+
+    quiet = BASE["instrument"] | {"noise": {"white_sd_nT": 0.005}}
+    motion = BASE["motion"] | {"duration_s": 600.0}
+    survey = scenario(seed, instrument=quiet, rate_Hz=10.0, motion=motion)
+    assert jitter_words(linear_state(loaded(tmp_path, survey, wandering))) == []
+
+
 def with_two_ranges(path: Path) -> None:
     """S2 reads a nT more on x, and less on y, where its output is beyond 25 000 nT."""
     with h5py.File(path, "r+") as survey:

@@ -81,6 +81,16 @@ def test_a_field_of_the_platform_turns_and_an_error_of_the_station_does_not(of_t
     assert turns_with_the_platform(linear_state(record)) is not of_the_station
 
 
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_readings_of_the_station_that_scatter_do_not_turn(seed: int) -> None:
+    """As of wrong stamps in a field that pulsates: faster than any course that turns, which is faster than itself."""
+    record, readings = synthetic(seed, turning_s=4.0), np.arange(0.0, 1205.0, 5.0)
+    scatter = np.interp(record.time, readings, np.random.default_rng(seed).standard_normal(len(readings)))
+    assert record.total_field is not None
+    record = replace(record, total_field=record.total_field + 2.0 * scatter)
+    assert not turns_with_the_platform(linear_state(record))
+
+
 TURNS = "turns with the platform"
 
 

@@ -14,6 +14,7 @@ from magtensor.loop.fitting.model import State
 ALPHA = 0.001  # for all sensors together
 BLOCKS = 20
 LEAST_PER_BLOCK = 30
+LEAST_OF_ALL = 0.01  # of the power of all that is left in it: slow noise that is far stronger turns, too
 LEAST_SHARE = 0.25  # of the power of the sensor's noise: less is made by what turns, too, and is not white
 
 
@@ -34,6 +35,9 @@ def jitter_words(state: State) -> list[str]:
     worst = int(np.argmax(mean * turning.mean(axis=0)))
     share = mean[worst] * turning[:, worst].mean() / square[:, worst].mean()
     if t[worst] < float(stdtrit(BLOCKS - 1, 1.0 - ALPHA / len(t))) or share < LEAST_SHARE:
+        return []
+    whole = (residual.across**2).reshape(len(residual.across), -1, 3).sum(axis=2)[:, worst].mean()
+    if mean[worst] * turning[:, worst].mean() < LEAST_OF_ALL * whole:
         return []
     scatter = float(np.sqrt(mean[worst]))
     amount = scatter * float(np.sqrt(np.mean((slope[:, worst] * residual.noise.reshape(-1, 3)[worst]) ** 2)))

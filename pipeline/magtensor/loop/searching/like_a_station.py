@@ -25,6 +25,7 @@ COURSES = 20  # half waves over the survey: what a station does slowly, whatever
 MORE_COURSES = 40  # the same of what is left, of which nobody knows how fast it is
 EACH = 20  # samples at least for each of them
 MOST_CHANNELS = 3
+CLEARLY = 2.0  # times what a station explains beside it: what neither is, both explain alike
 MOSTLY = 0.5  # of what is left, beside white noise, is slow: of the platform or of a station
 
 
@@ -60,7 +61,9 @@ def turns_with_the_platform(state: State) -> bool:
     if residual.along is None or not count:
         return False
     slow = _half_waves(x, count)[residual.samples]
-    fixed, station = _on_the_platform(x, slow), joined([x.on_reference(course, "nT", "") for course in slow.T])
+    fixed = _on_the_platform(x, slow)
+    as_many = _half_waves(x, 3 * count)[residual.samples]  # what turns is faster, and follows what is faster
+    station = joined([x.on_reference(course, "nT", "") for course in as_many.T])
     given, along = [] if state.terms is None else [state.terms], replace(residual, across=None)
     together = _beyond(along, WHITE, joined([fixed, station]), given)[0]
     if together <= MOSTLY * (float(np.sum(residual.along**2)) - len(residual.along)):
@@ -69,7 +72,7 @@ def turns_with_the_platform(state: State) -> bool:
         _beyond(along, WHITE, fixed, [*given, station])[0],
         _beyond(along, WHITE, station, [*given, fixed])[0],
     )
-    return turning > steady and _beyond(along, state.colours, fixed, [*given, station])[1] <= APART_ALPHA
+    return turning > CLEARLY * steady and _beyond(along, state.colours, fixed, [*given, station])[1] <= APART_ALPHA
 
 
 def channels_of_the_total_field(state: State, alpha: float) -> list[str]:
