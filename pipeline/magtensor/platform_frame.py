@@ -246,7 +246,8 @@ def _attitude_delay(survey: Survey) -> Delay | None:
     b, q = (np.asarray(survey.values(name), dtype=float) for name in ("calibrated/b", "attitude"))
     use = survey.good & np.isfinite(b).all(axis=(1, 2)) & np.isfinite(q).all(axis=1)
     world = survey.values("reference/world_field") if "reference/world_field" in survey else None
-    return attitude_delay(survey.time[use], q[use], b[use].mean(axis=1), world)
+    most = np.median(b[use], axis=1)  # one sensor that is late by itself says nothing of the attitude
+    return attitude_delay(survey.time[use], q[use], most, world)
 
 
 def _noise(survey: Survey, b: Array, use: NDArray[np.bool_]) -> Array:
