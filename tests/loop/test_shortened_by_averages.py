@@ -105,3 +105,14 @@ def without_reference(path: Path, out: Path) -> None:
     shutil.copy(path, out)
     with h5py.File(out, "r+") as file:
         del file["reference"]
+
+
+def test_the_next_order_of_a_long_mean_is_no_error_of_the_base_station(tmp_path: Path) -> None:
+    """The fourth rate of change, by half a per cent of what the second explains."""
+    hand = {"type": "tumbling", "duration_s": 200.0, "rate_rms_deg_s": 40.0, "rate_time_s": 5.0}
+    mean = {"type": "averaging", "spread_s2": [0.4**2 / 24.0] * 4}
+    path = survey_file(tmp_path, scenario(61, mean, rate_Hz=10.0, motion=hand))
+    told = magtensor.close_loop(path, search=["averaging"]).verdict
+    assert [a["error_model"] for a in told["adopted"]] == ["averaging"]
+    words = told["unexplained"]["description"]
+    assert "of what averaging makes of it, whose law may leave as much" in words and "base station" not in words

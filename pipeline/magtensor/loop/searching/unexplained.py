@@ -7,13 +7,15 @@ sensor whose matrix is not constant, or an error model that is significant and w
 
 from __future__ import annotations
 
+from dataclasses import replace
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
 
 from magtensor.calibration.types import Array
 from magtensor.loop.evidence.own_noise import OwnNoise
-from magtensor.loop.evidence.residual import Residual
+from magtensor.loop.evidence.residual import Residual, taken_off
 from magtensor.loop.evidence.spectrum import line_of_the_station, spectral_lines
 from magtensor.loop.fitting.model import Record, State
 from magtensor.loop.fitting.refit import disturbed
@@ -47,6 +49,7 @@ OF_A_LINE = 0.1  # of the square of what is left above the noise: less than that
 MUCH = 3.0  # times the white noise of an output: no base station beside a site differs by so much unnoticed
 TWICE = 2.0  # what the slow noise of the sensors, known from few frequencies, makes of it
 NO_NOISE = 5.0  # times the white noise: of noise whose power goes with 1/f the slow part has three at most
+OF_A_LAW = 0.02  # of what an effect makes of |b| - F, that the next order of its law may be
 NOISE = "what is left is noise: white, and slow noise of each sensor alone or of the reference"
 
 
@@ -138,7 +141,10 @@ def _what_shows(found: Search, record: Record, excess: float, sparse: SparseRead
     if slow > TWICE * noise and (no_station or slow > MUCH * state.residual.scale):
         where = "in all sensors alike" if alike else "in their mean"
         cause = ""
-        if turning:
+        largest, made = _largest_of_the_total_field(state)
+        if slow < OF_A_LAW * made:
+            cause = f": less than {OF_A_LAW:.0%} of what {largest} makes of it, whose law may leave as much"
+        elif turning:
             cause = ": it turns with the platform, as the field of something on it that no channel logs"
         elif alike:
             cause = ": an error of the base station, or a field that it does not see, of the site or of the platform"
@@ -146,6 +152,22 @@ def _what_shows(found: Search, record: Record, excess: float, sparse: SparseRead
                 cause += f"; it follows {' and '.join(names)}"
         words.append(f"{slow:.3g} nT rms of |b| - F, {where}, is no white noise{cause}")
     return words
+
+
+def _largest_of_the_total_field(state: State) -> tuple[str, float]:
+    """The adopted model that makes most of |b| - F, and how much, nT rms; 0 of none."""
+    residual, found = state.residual, ("", 0.0)
+    assert residual.along is not None
+    none = replace(residual, across=None, along=np.zeros_like(residual.along), sighted=None)
+    for model, theta in zip(state.adopted, state.theta, strict=True):
+        terms = model.terms(state.excitation)
+        if terms.delay is None:
+            made = taken_off(none, terms.at(residual.samples), theta).along
+            assert made is not None
+            found = max(
+                found, (model.name, float(np.sqrt(np.mean((made / residual.reference_gain) ** 2)))), key=itemgetter(1)
+            )
+    return found
 
 
 def noise_words(state: State, record: Record, band: Band | None) -> list[str]:
