@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import filecmp
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
@@ -118,6 +119,12 @@ def run_plan(
     return compute(planned, empty_survey(planned), progress=progress).write(output)
 
 
+def _alike(one: Path, other: Path) -> bool:
+    """Whether two paths are one file, or files of the same bytes."""
+    both = one.is_file() and other.is_file()
+    return one.resolve() == other.resolve() or (both and filecmp.cmp(one, other, shallow=False))
+
+
 def require_verifying(planned: Plan, verify: Path | Held, files: Sequence[Path]) -> None:
     """See that a verification survey can be read, and is none of the survey's files: now and not after the fit.
 
@@ -125,7 +132,7 @@ def require_verifying(planned: Plan, verify: Path | Held, files: Sequence[Path])
         UsageError: it is the survey itself.
         DataError: it cannot be read and prepared as the recipe does.
     """
-    if isinstance(verify, Path) and verify.resolve() in {f.resolve() for f in files}:
+    if isinstance(verify, Path) and any(_alike(verify, file) for file in files):
         raise UsageError(f"{verify}: this is the survey itself; a verification survey is one that the fit has not seen")
     load_as(planned, verify)
 

@@ -177,10 +177,12 @@ def test_a_result_is_no_survey(bench: Any, finished: Path, tmp_path: Path) -> No
     bench("joint", tmp_path / "copy" / "result.nc").refused("this is a result of magtensor, not a survey")
 
 
-def test_the_survey_itself_verifies_nothing(command: Any, sound: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("copied", [False, True])
+def test_the_survey_itself_verifies_nothing(command: Any, sound: Path, tmp_path: Path, copied: bool) -> None:
+    verify = Path(shutil.copy(sound, tmp_path / "copy.h5")) if copied else sound
     recipe = tmp_path / "r.yaml"
     recipe.write_text("title: t\nstages: [load, detrend_diurnal, calibrate_joint]\n")
-    told = command("run", recipe, "--input", sound, "--verify", sound, "--output", tmp_path / "out")
+    told = command("run", recipe, "--input", sound, "--verify", verify, "--output", tmp_path / "out")
     told.refused("this is the survey itself", status=2)
 
 
