@@ -195,7 +195,8 @@ def _of_one_that_switches(state: State, fixed: int) -> tuple[list[int], str] | N
             sensors = [s for s, v in zip(state.excitation.sensors, first.reshape(-1, 3), strict=True) if v.any()]
             return (
                 places,
-                f"something in {', '.join(sensors)} switches along one vector, more often than such events tell",
+                f"something in {', '.join(sensors)} switches along one vector more often than such events tell, or "
+                "goes on changing",
             )
     return None
 
