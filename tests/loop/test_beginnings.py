@@ -222,6 +222,7 @@ def test_a_beginning_that_another_survey_hardly_shows_is_no_impossible_field(see
     assert abs(began[0] - came_from[0]) < 100e3  # twice the field
 
 
+@pytest.mark.long
 def test_what_each_sensor_began_with_is_said_to_be_no_warming_up_of_its_own() -> None:
     """Four thermometers, a lag of 60 s, and sensors that were all at 15 degC at the start: one number for all of them
     is not what they began with, and something dies away as fast as they lag."""

@@ -91,6 +91,7 @@ def test_a_channel_that_shows_nothing_beside_courses_of_time_is_a_drift_through_
     assert not told.seen and "a drift like any other" in told.refused
 
 
+@pytest.mark.long
 def test_the_sum_of_a_current_over_time_is_no_lag(tmp_path: Path) -> None:
     """Iron that a current magnetises a little more each second: as a response that lags by many surveys, with a drift
     that takes off most of it again, it would go anywhere in another survey."""

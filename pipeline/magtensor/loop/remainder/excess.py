@@ -44,8 +44,11 @@ def white_noise(residual: Residual) -> float:
 
 
 def noise_floor(residual: Residual, *, all_noise: bool) -> float:
-    """nT, as `white_noise`; where all that is left is noise, that of the band that a filter has left of it."""
-    band = limited_band(residual) if all_noise else None
+    """nT, as `white_noise`; where all that is left between the sensors is noise, that of the band that a filter left.
+
+    Of a single sensor it is not asked: |b| - F lacks high frequencies where it is the base station's, read seldom.
+    """
+    band = limited_band(residual) if all_noise and residual.across is not None else None
     return white_noise(residual) if band is None else band.rms_nT
 
 
