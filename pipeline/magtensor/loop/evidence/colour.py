@@ -98,7 +98,7 @@ def colour_of(
     share = (freedom or k) / k
     if n < _LEAST:
         return _white(columns, share)
-    power = _spectrum(columns, share)
+    power = mean_power(columns, share)
     frequency = np.arange(1, n) / (2.0 * n)  # cycles per sample
     edges = np.unique(np.round(np.geomspace(1, n, min(60, n // 4))).astype(int))
     edges = edges[edges >= min(above, n // 2)]
@@ -124,7 +124,7 @@ def _white(columns: Array, share: float) -> Colour:
     return Colour(None, max(float(np.mean(columns**2)) / share, 1e-300))
 
 
-def _spectrum(columns: Array, share: float) -> Array:
+def mean_power(columns: Array, share: float = 1.0) -> Array:
     """(N - 1,) mean power of the columns of (N, K) at the cosine frequencies above zero."""
     from scipy.fft import dct
 

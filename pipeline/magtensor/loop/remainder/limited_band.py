@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from magtensor.calibration.types import Array
+from magtensor.loop.evidence.colour import mean_power
 from magtensor.loop.evidence.residual import Residual
 
 OCTAVES = 4  # below the highest frequency, in which a filter may begin: what is slower than that moves
@@ -42,7 +42,7 @@ def limited_band(residual: Residual) -> Band | None:
     count, each = len(left), np.mean(left**2, axis=0) / one
     if count < LEAST or each.max() > UNLIKE * each.min():
         return None
-    power = _power(left)
+    power = mean_power(left)
     edges = [0, *(count >> k for k in range(OCTAVES, -1, -1))]
     levels = np.array([power[a:b].mean() for a, b in pairwise(edges)])
     level = float(levels[1:-1].max())
@@ -52,11 +52,3 @@ def limited_band(residual: Residual) -> Band | None:
     part = float(parts[0] + np.minimum(levels[1:] / level, 1.0) @ parts[1:])
     slow = max(levels[0] / level - 1.0, 0.0) * parts[0] / part
     return Band(residual.scale * float(np.sqrt(level * part / one.mean())), part, float(np.sqrt(slow)))
-
-
-def _power(series: Array) -> Array:
-    """(N,) mean square of the columns (N, K) at each cosine frequency."""
-    from scipy.fft import dct
-
-    out: Array = np.mean(np.asarray(dct(series, axis=0, norm="ortho")) ** 2, axis=1)
-    return out
