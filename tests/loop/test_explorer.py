@@ -133,7 +133,7 @@ def test_a_mistake_changes_nothing(explorer: Explorer, name: str, settings: dict
 
 
 def test_a_source_that_the_log_shows_is_none_that_nobody_logged(survey: Path) -> None:
-    with pytest.raises(magtensor.DataError, match="taken off: its waveform follows channel current_heater"):
+    with pytest.raises(magtensor.DataError, match="taken off: its waveform goes as channel current_heater"):
         magtensor.explore(survey, search=["latent_source"]).adopt("latent_source")
 
 

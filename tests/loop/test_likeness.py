@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from loop_cases import Array, synthetic
 
-from magtensor.loop.searching.likeness import followed_in_part
+from magtensor.loop.searching.likeness import _correlations, followed, followed_in_part
 
 SAMPLES = 1200
 
@@ -42,3 +42,27 @@ def test_what_has_nothing_to_do_with_a_source_is_not_named(seed: int) -> None:
     record = replace(synthetic(1, SAMPLES), logged=channels)
     for source in (telegraph(rng, 60.0), smooth(rng, 40.0), telegraph(rng, 300.0)):
         assert followed_in_part(record.time, source, record) == ""
+
+
+@pytest.mark.parametrize("lag", [0, 7])
+def test_the_rate_of_a_channel_is_named_as_that(lag: int) -> None:
+    """A pick-up loop beside a current, whose log is noisy: faster than the means that slow courses are compared by."""
+    rng = np.random.default_rng(3)
+    samples, step = 9000, 0.1
+    current = np.convolve(rng.standard_normal(samples + lag + 40), np.hanning(21), mode="valid")[: samples + lag]
+    rate = np.gradient(current, step)[:samples]
+    logged = {"other": rng.standard_normal(samples), "current": current[lag:] + 0.02 * rng.standard_normal(samples)}
+    record = replace(synthetic(1, samples), time=step * np.arange(samples), logged=logged)
+    found = followed(record.time, rate / rate.std() + 0.1 * rng.standard_normal(samples), record)
+    assert found is not None and found.words == "the rate of channel current" and found.course == "current (its rate)"
+    assert found.lag_s == pytest.approx(lag * step, abs=1.01 * step) and abs(found.correlation) > 0.9
+
+
+def test_correlations_are_those_of_what_two_series_have_in_common() -> None:
+    rng = np.random.default_rng(4)
+    late, early = np.cumsum(rng.standard_normal((2, 300)), axis=1)
+    shifts = np.array([0, 3, -3, 29, -29])
+    for shift, c in zip(shifts, _correlations(late, early, shifts), strict=True):
+        later, sooner = max(shift, 0), max(-shift, 0)
+        assert c == pytest.approx(np.corrcoef(late[later : 300 - sooner], early[sooner : 300 - later])[0, 1], abs=1e-9)
+    assert _correlations(late, np.full(300, 2.0), shifts).tolist() == [0.0] * 5

@@ -44,6 +44,7 @@ from magtensor.loop.searching.contribution import happens_once, without_models
 from magtensor.loop.searching.gates import OF_THE_LAW, Candidate, explained_before, explained_by, gained_of_a_log
 from magtensor.loop.searching.likeness import (
     FEW,
+    Likeness,
     effect_along,
     followed,
     followed_by_a_curve,
@@ -62,7 +63,7 @@ MOST_OF_A_SAMPLE = 50.0  # log likelihood: half of the largest squared residual 
 IMPROPER = 1 / 3  # of the noise of a sensor's usual axis
 SINGLE_STRETCH = "it acts in a single short stretch, which no other can confirm"
 ONCE = 0.9  # of a waveform's power in a stretch as long as one that is held out
-OF_A_CHANNEL = "its waveform follows channel"
+OF_A_CHANNEL = "its waveform goes as"
 SECOND = 0.1  # a second factor this strong beside the first: not one waveform
 
 
@@ -77,7 +78,7 @@ class Sought:
         p: that noise of the sensors alone gives so strong a one, all bands considered.
         share: of the variance across that it explains, within 0 and 1: what C and o have taken of it is not there.
         gain: on held-out stretches, of each sensor's whitened residual predicted from the others.
-        like: channel, lag s, power and correlation of the channel it follows; None where it follows none.
+        like: the channel it follows; None where it follows none.
         switches: whether it has two levels.
         of_the_log: whether noise in the logs of adopted channels explains it.
         objection: why it is not adopted; "" where nothing stands against it.
@@ -92,7 +93,7 @@ class Sought:
     p: float
     share: float
     gain: Gain
-    like: tuple[str, float, int, float] | None
+    like: Likeness | None
     switches: bool
     of_the_log: bool
     objection: str
@@ -154,7 +155,7 @@ def sought(state: State, record: Record, *, may_follow: bool = False) -> Sought 
     elif not gain.consistent:
         objection = "the sensors do not predict each other with it on held-out stretches"
     elif like is not None and not may_follow:
-        objection = f"{OF_A_CHANNEL} {like[0]}"
+        objection = f"{OF_A_CHANNEL} {like.words}"
     elif left_by := effect_along(state, basis, seen):
         objection = f"the sensors feel it as they feel {left_by}, which may leave it"
     elif _acts_once(values):
@@ -229,7 +230,7 @@ def tried_source(
     gain = found.gain
     folds, p = Blocks.equal(len(state.residual.affine)), found.p
     evidence = Assessment(estimate, folds, gain, gain, None, None, p, p, p, 0.0, state.colours, estimate.theta)
-    like = found.like[0] if found.like else followed_by_a_curve(found.time, found.values, record)
+    like = found.like.course if found.like else followed_by_a_curve(found.time, found.values, record)
     return found, Source(record, after, Candidate(model, 1, terms, evidence, p, p, p, ALPHA), like)
 
 
@@ -396,11 +397,8 @@ def shared_words(found: Sought, sensors: Sequence[str]) -> str:
         f"the sensors share one waveform ({each}; {part} of the variance of what differs between them), which {course}"
     )
     if found.like is not None:
-        name, lag, power, correlation = found.like
-        to_the = "" if power == 1 else f" to the power {power}"
-        words += (
-            f" and is most like channel {name}{to_the} with a lag of {lag:.3g} s (correlation {abs(correlation):.2f})"
-        )
+        like, correlation = found.like, abs(found.like.correlation)
+        words += f" and is most like {like.words} with a lag of {like.lag_s:.3g} s (correlation {correlation:.2f})"
         if independent(found.values) < FEW:
             words += ", as one of several channels, powers and lags is of anything that swings so seldom"
     else:

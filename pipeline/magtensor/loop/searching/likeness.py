@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from magtensor.calibration.types import Array
 from magtensor.error_models.curves import along_a_curve, bends_of
@@ -19,6 +20,8 @@ from magtensor.loop.searching.contribution import happens_once
 LIKE_A_CHANNEL = 0.7  # correlation from which a logged channel is the suspect and no hidden source
 MOST_LAG = 0.1  # of the survey, in which a channel is compared with the waveform
 COMPARED = 400  # points at which it is
+MOST_COMPARED = 20000
+LEAST_POWER = 1e-9  # of a series' own, below which it is constant there
 LIKE_AN_EFFECT = 0.9  # cosine; of two directions off the plane of four sensors one pair in a thousand is nearer
 ONE_SENSOR = 0.9  # of what something that happened once does
 ONE_DIRECTION = 0.9  # of an effect's power
@@ -29,28 +32,86 @@ FEW = 8.0  # independent values: any course with fewer is like some channel, thr
 REMEMBERS = 0.3  # of its size, what other samples change of a regressor that remembers the field there
 
 
-def followed(time: Array, values: Array, record: Record) -> tuple[str, float, int, float] | None:
-    """The channel, lag, power and correlation that come nearest to a waveform, if they come near; of delays of its log
-    either way the shortest that does."""
-    points = np.linspace(time[0], time[-1], min(COMPARED, len(time)))
-    step = points[1] - points[0]
-    wave = _means(time, values, points)
-    most = max(1, int(MOST_LAG * len(points)))
-    best: tuple[str, float, int, float] | None = None
-    for name, channel in record.logged.items():
-        for column in channel.reshape(len(channel), -1).T:
-            sampled = _means(record.time, column, points)
-            for power in (1, 2, 3):
-                series = sampled**power
-                for shift in sorted(range(-most, most + 1), key=abs):
-                    later, sooner = max(shift, 0), max(-shift, 0)
-                    a, b = wave[later : len(wave) - sooner], series[sooner : len(series) - later]
-                    if not a.std() > 0 or not b.std() > 0:
-                        continue
-                    c = float(np.corrcoef(a, b)[0, 1])
-                    if best is None or abs(c) > abs(best[3]) + 0.01:
-                        best = (name, shift * step, power, c)
-    return best if best is not None and abs(best[3]) > LIKE_A_CHANNEL else None
+@dataclass(frozen=True)
+class Likeness:
+    """The channel that a waveform goes with.
+
+    Attributes:
+        lag_s: how late the waveform is, s.
+        power: of the channel; 1 where it goes with its rate.
+        correlation: of the two, with its sign.
+        rate: whether it goes with the channel's rate of change.
+    """
+
+    channel: str
+    lag_s: float
+    power: int
+    correlation: float
+    rate: bool
+
+    @property
+    def words(self) -> str:
+        """What of the channel it goes with."""
+        if self.rate:
+            return f"the rate of channel {self.channel}"
+        return f"channel {self.channel}" + (f" to the power {self.power}" if self.power > 1 else "")
+
+    @property
+    def course(self) -> str:
+        """The channel, and what of it if that is its rate."""
+        return f"{self.channel} (its rate)" if self.rate else self.channel
+
+
+def followed(time: Array, values: Array, record: Record) -> Likeness | None:
+    """What of a channel comes nearest to a waveform, if anything comes near; of delays of its log either way the
+    shortest that does. Means are compared, in which the waveform's noise is less, and samples, for what is fast."""
+    best: Likeness | None = None
+    for count in sorted({min(COMPARED, len(time)), min(MOST_COMPARED, len(time))}):
+        points = np.linspace(time[0], time[-1], count)
+        step = points[1] - points[0]
+        wave = _means(time, values, points)
+        between = 0.5 * (wave[1:] + wave[:-1])  # as smooth as what two neighbouring means differ by
+        shifts = _shortest_first(max(1, int(MOST_LAG * count)))
+        for name, channel in record.logged.items():
+            for column in channel.reshape(len(channel), -1).T:
+                sampled = _means(record.time, column, points)
+                compared = [(wave, sampled**power, power, False) for power in (1, 2, 3)]
+                if min(independent(between), independent(np.diff(sampled))) > FEW:
+                    compared.append((between, np.diff(sampled), 1, True))
+                for ours, series, power, rate in compared:
+                    for shift, c in zip(shifts, _correlations(ours, series, shifts), strict=True):
+                        if best is None or abs(c) > abs(best.correlation) + 0.01:
+                            best = Likeness(name, float(shift * step), power, float(c), rate)
+    return best if best is not None and abs(best.correlation) > LIKE_A_CHANNEL else None
+
+
+def _shortest_first(most: int) -> NDArray[np.int_]:
+    """(2 most + 1,) shifts either way."""
+    shifts = np.arange(-most, most + 1)
+    return shifts[np.argsort(np.abs(shifts), kind="stable")]
+
+
+def _correlations(late: Array, early: Array, shifts: NDArray[np.int_]) -> Array:
+    """Of two series (n,), the first moved back by each of some shifts, where both are; 0 where one is constant."""
+    from scipy.signal import correlate
+
+    n = len(late)
+    late, early = late - late.mean(), early - early.mean()
+    a, b = np.maximum(shifts, 0), np.maximum(-shifts, 0)
+
+    def sums(series: Array, first: NDArray[np.int_], last: NDArray[np.int_]) -> Array:
+        total = np.concatenate([[0.0], np.cumsum(series)])
+        out: Array = total[last] - total[first]
+        return out
+
+    of_late, of_early = sums(late, a, n - b), sums(early, b, n - a)
+    overlap = n - np.abs(shifts)
+    both = correlate(late, early, method="fft")[shifts + n - 1] - of_late * of_early / overlap
+    late_power = sums(late**2, a, n - b) - of_late**2 / overlap
+    early_power = sums(early**2, b, n - a) - of_early**2 / overlap
+    moves = (late_power > LEAST_POWER * late.dot(late)) & (early_power > LEAST_POWER * early.dot(early))
+    out: Array = np.where(moves, both / np.sqrt(np.where(moves, late_power * early_power, 1.0)), 0.0)
+    return out
 
 
 def followed_by_a_curve(time: Array, values: Array, record: Record) -> str:
@@ -100,7 +161,8 @@ def _comes_and_goes(course: Array) -> bool:
 
 
 def independent(waveform: Array) -> float:
-    """How many independent values a waveform (N,) amounts to: of sines and cosines with as much power each, so many."""
+    """How many independent values a waveform (N,) amounts to: of sines and cosines with as much power each, so many;
+    0 of one that is constant."""
     from scipy.fft import rfft
 
     power = np.abs(rfft(waveform - waveform.mean())) ** 2
