@@ -143,11 +143,12 @@ def test_what_is_no_channel_is_left_out_with_the_reason(tmp_path: Path, name: st
             {"b_raw": ((), np.zeros((60, 12)), {"units": "nT"})},
             r"b_raw: shape \(60, 12\) is not \(time, sensor, axis\)",
         ),
-        ({"b_raw": ((), np.zeros((59, 4, 3)), {"units": "nT"})}, r"b_raw: shape \(59, 4, 3\)"),
+        ({"b_raw": ((), np.zeros((59, 4, 3)), {"units": "nT"})}, "time has 60 values, and b_raw has 59 samples"),
         ({"b_raw": ((), np.zeros((60, 4, 3)), {})}, "b_raw: it has no units; nT is expected"),
         ({"b_raw": ((), np.zeros((60, 4, 3)), {"units": "V"})}, "b_raw: 'V' is a voltage"),
         ({"b_raw": ((), np.zeros((60, 4, 3)), {"units": "nanoT"})}, "b_raw: unknown unit 'nanoT'"),
         ({"b_raw": ((), np.full((60, 4, 3), "x"), {"units": "nT"})}, "b_raw: it holds text; real numbers are needed"),
+        ({"attitude": ((), np.full((60, 4), 1.0), {})}, "attitude: the quaternions' median norm is 2, not 1"),
         ({"position": ((), np.zeros((3, 4)), {"units": "m"})}, r"position: shape \(3, 4\) is not \(sensor 4, axis 3\)"),
         ({"temperature": ((), np.zeros(17), {"units": "degC"})}, r"temperature: shape \(17,\) is not \(time 60\)"),
         ({"current_a": ((), np.zeros(60), {"units": "V"})}, "current_a: 'V' is a voltage, an electric current"),
@@ -166,6 +167,16 @@ def test_what_is_wrong_is_said_with_file_and_dataset(tmp_path: Path, changes: di
     with pytest.raises(DataError, match=message) as caught:
         read_canonical(plain_file(tmp_path / "wrong.h5", **changes))
     assert "wrong.h5" in str(caught.value)
+
+
+def test_an_attitude_that_is_no_rotation_is_taken_as_missing(tmp_path: Path) -> None:
+    attitude = np.tile([0.0, 0.6, 0.0, 0.8], (60, 1))
+    attitude[:5] = 0.0  # unknown
+    attitude[7] *= 1.5
+    survey = read_canonical(plain_file(tmp_path / "q.h5", attitude=((), attitude, {})))
+    assert np.isnan(survey.values("attitude")).all(axis=1).nonzero()[0].tolist() == [0, 1, 2, 3, 4, 7]
+    assert "6 quaternions whose norm is not 1" in " ".join(survey.attributes["notes"])
+    np.testing.assert_array_equal(survey.values("attitude")[10:], attitude[10:])
 
 
 def test_unknown_dimension_names(tmp_path: Path) -> None:

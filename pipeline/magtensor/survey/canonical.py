@@ -14,6 +14,7 @@ from magtensor.atomic import atomic_path
 from magtensor.errors import DataError
 from magtensor.survey.hdf5 import read_hdf5
 from magtensor.survey.model import AXES, Survey
+from magtensor.survey.quaternions import unit_quaternions
 from magtensor.survey.tables import Column, Tables
 from magtensor.survey.times import numbers_to_seconds, require_digits, since, split_since, to_epoch
 from magtensor.units import UnitError, convert
@@ -72,7 +73,13 @@ def survey_from(tables: Tables) -> Survey:
             )
     time, epoch = _time(tables.find("time"))
     raw = tables.find("b_raw")
-    if len(raw.shape) != 3 or raw.shape[0] != len(time) or raw.shape[2] != 3:
+    if len(raw.shape) == 3 and raw.shape[2] == 3 and raw.shape[0] != len(time):
+        raise DataError(
+            f"time has {len(time)} values, and b_raw has {raw.shape[0]} samples",
+            where=tables.where,
+            hint="every sample has a time of its own, in the same row",
+        )
+    if len(raw.shape) != 3 or raw.shape[2] != 3:
         raise DataError(
             f"shape {raw.shape} is not (time, sensor, axis) = ({len(time)}, sensors, 3)",
             where=raw.origin,
@@ -227,6 +234,8 @@ def _variable(name: str, column: Column, sizes: Mapping[str, int], notes: list[s
         values = values.astype(bool)
     if values.dtype.kind == "f" or (known and known[1]):
         values = values.astype(np.float64)
+    if name == "attitude":
+        values = unit_quaternions(values.astype(np.float64), column.origin, notes)
     if known is None or known[1] is None:
         if column.units is not None or known:
             attributes["units"] = column.units or "1"

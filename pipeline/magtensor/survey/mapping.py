@@ -15,6 +15,7 @@ from magtensor.survey.canonical import expected
 from magtensor.survey.flags import Flag, flag_ranges
 from magtensor.survey.model import AXES, Survey
 from magtensor.survey.quantities import Rows, interpolated, listed, quantity, rows_of
+from magtensor.survey.quaternions import unit_quaternions
 from magtensor.survey.sections import (
     REFERENCE_KINDS,
     AltitudeSection,
@@ -29,9 +30,6 @@ from magtensor.survey.source import Source
 from magtensor.survey.time_base import moves_on
 from magtensor.survey.times import since, split_since, to_epoch
 from magtensor.units import convert
-
-# A unit quaternion recorded with four decimals is within 1e-4 of norm 1; half of that again is a bad row.
-QUATERNION_NORM_TOLERANCE = 0.01
 
 
 class _Mapper:
@@ -164,13 +162,8 @@ class _Mapper:
                 raise DataError(f"{found.shape[1]} columns for a quaternion", where=where)
             if section.scalar == "first":
                 found = np.roll(found, -1, axis=1)
-        norm = np.linalg.norm(found, axis=1)
-        off = np.abs(norm - 1.0) > QUATERNION_NORM_TOLERANCE
-        if off.sum() > 0.5 * np.isfinite(norm).sum():
-            raise DataError(f"the quaternions' median norm is {np.nanmedian(norm):.3g}, not 1", where=where)
-        if off.any():
-            self.notes.append(f"attitude: {int(off.sum())} quaternions whose norm is not 1 are taken as missing")
-        found = np.where(off[:, None], np.nan, found) / np.where(off, 1.0, norm)[:, None]
+        found = unit_quaternions(found, where, self.notes)
+        found = found / np.linalg.norm(found, axis=1, keepdims=True)
         if section.maps == "world to platform":
             found = found * np.array([-1.0, -1.0, -1.0, 1.0])
         if rows is not self.rows:
