@@ -172,7 +172,7 @@ def _disagreement(outcome: dict[str, Any]) -> str:
         return f"; the verification survey's total field has no {as_read}: it is judged as it was read"
     if refuted := verify.get("not_on_this_survey"):
         return f"; NOT taken off the verification survey, for the lengths of its vectors refute it: {refuted}"
-    contradicted = str(verify.get("contradicted", ""))
+    contradicted, beyond = str(verify.get("contradicted", "")), _beyond(verify)
     key = "total_field_rms_nT"
     before, after, here = ((b or {}).get(key) or {} for b in (verify["before"], verify["after"], held_out["after"]))
     known = [v is not None for v in (before.get("all"), after.get("all"), here.get("all"))]
@@ -186,12 +186,11 @@ def _disagreement(outcome: dict[str, Any]) -> str:
         )
     if worse:
         what = f", {contradicted} above all" if contradicted else ""
-        why = f" ({beyond})" if (beyond := verify.get("extrapolated")) else ""
-        return f"; what was added makes the verification survey worse{what}: it does not carry over{why}"
+        return f"; what was added makes the verification survey worse{what}: it does not carry over{beyond}"
     if contradicted:
         return f"; |b| would be nearer to the verification survey's total field without {contradicted}"
     if not apart:
-        return _carried_over(held_out, before, after)
+        return _carried_over(held_out, verify)
     each = {s: v for s, v in after.items() if s != "all" and v is not None and here.get(s)}
     sensors = [s for s, v in each.items() if v > DISAGREES * here[s]]
     where = f" of {', '.join(sensors)}" if 0 < len(sensors) < len(each) else ""
@@ -199,10 +198,11 @@ def _disagreement(outcome: dict[str, Any]) -> str:
     if after["all"] > DISAGREES * left:
         words = (
             f"; the verification survey disagrees with the calibration{where}: something changed between the two, or "
-            "the first shows too little of what the second needs"
+            f"the first shows too little of what the second needs{beyond}"
         )
     if left > DISAGREES * here["all"]:
         too = ", or what is unexplained here too" if outcome["unexplained"]["present"] else ""
+        too += f", or what an effect comes to beyond what is known of it{'' if words else beyond}" if beyond else ""
         words += (
             f"; the verification survey has {figure(left)} nT rms of |b| - F{where} that no calibration would take "
             f"off: noise or disturbances of its own{too}"
@@ -210,9 +210,15 @@ def _disagreement(outcome: dict[str, Any]) -> str:
     return words
 
 
-def _carried_over(held_out: dict[str, Any], before: dict[str, Any], after: dict[str, Any]) -> str:
+def _beyond(verify: dict[str, Any]) -> str:
+    """Which effects a verification survey takes beyond what the calibration has seen."""
+    return f" ({beyond})" if (beyond := verify.get("extrapolated")) else ""
+
+
+def _carried_over(held_out: dict[str, Any], verify: dict[str, Any]) -> str:
     """Words where what takes off most of the error of held-out blocks takes off little of a verification survey's."""
     key = "total_field_rms_nT"
+    before, after = verify["before"][key], verify["after"][key]
     noise = _of_all(held_out["after"], key)
     here = _of_all(held_out.get("before") or {}, key) ** 2 - noise**2
     there = before["all"] ** 2 - noise**2
@@ -221,7 +227,7 @@ def _carried_over(held_out: dict[str, Any], before: dict[str, Any], after: dict[
         return ""
     return (
         f"; of what the verification survey errs by beyond that, what was added takes off {gone / there:.0%} only: the "
-        "law may be another one, or something else is beside it there"
+        f"law may be another one{_beyond(verify)}, or something else is beside it there"
     )
 
 

@@ -170,6 +170,25 @@ def test_a_site_that_was_modelled_is_in_another_survey_too(kind: str, words: str
     assert words in sentence(of_errors((2.0, 0.2), (2.0, 3.0), kind))
 
 
+@pytest.mark.parametrize(
+    ("there", "left_by_any_nT", "said"),
+    [
+        ((2.0, 3.0), None, "does not carry over (channel_response: pressure"),
+        ((0.6, 0.55), None, "the law may be another one (channel_response: pressure"),
+        ((5.0, 3.0), 0.2, "too little of what the second needs (channel_response: pressure"),
+        ((5.0, 3.0), 2.9, "its own, or what an effect comes to beyond what is known of it (channel_response: pressure"),
+    ],
+)
+def test_an_effect_beyond_what_is_known_of_it_may_be_why_another_survey_disagrees(
+    there: tuple[float, float], left_by_any_nT: float | None, said: str
+) -> None:
+    outcome = of_errors((1.0, 0.2), there)
+    outcome["error"]["verify"]["left_by_any_calibration_nT"] = left_by_any_nT
+    assert said not in sentence(outcome)
+    outcome["error"]["verify"]["extrapolated"] = "channel_response: pressure goes 27 hPa beyond"
+    assert said in sentence(outcome)
+
+
 @pytest.mark.parametrize(("wandering_nT", "told_of"), [(0.0, True), (2.0, False)])
 def test_a_line_is_told_where_it_is_much_of_what_is_left(wandering_nT: float, told_of: bool) -> None:
     time = np.arange(SAMPLES)
