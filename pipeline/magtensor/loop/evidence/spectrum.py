@@ -1,7 +1,13 @@
-"""Lines in the spectrum of a residual."""
+"""Lines in the spectrum of a residual.
+
+Sought at the frequencies of whole periods in the survey and halfway between them: of each set noise is independent, and
+a line that lies between two frequencies of one set, where it loses up to six tenths of its power, is near one of the
+other.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -45,26 +51,26 @@ class _Grid:
         places = np.concatenate([[0.0], np.cumsum(steps)]) if even else (time - time[0]) / step
         return cls(places, step, int(np.rint(places[-1])) + 1, even)
 
-    @property
-    def frequency(self) -> Array:
-        """(M,) Hz, above zero and below the highest of an even number of samples, which has one phase and not two."""
-        return np.arange(1, (self.n + 1) // 2) / (self.n * self.step)
-
-    def spectrum(self, coordinates: Array) -> NDArray[np.complex128]:
-        """(M, K) of coordinates (N, K)."""
+    def spectra(self, coordinates: Array) -> Iterator[tuple[Array, NDArray[np.complex128]]]:
+        """Frequencies (M,) in Hz and the spectrum (M, K) of coordinates (N, K) at them: at whole periods in the survey,
+        above none and below the highest of an even number of samples, which has one phase and not two; and halfway."""
         places, n = self.places, self.n
         found = (
-            _of_a_grid(coordinates, places, n) if self.even else transform(coordinates, places, n) * (n / len(places))
+            _of_a_grid(coordinates, places, n)
+            if self.even
+            else transform(coordinates, places, 2 * n) * (n / len(places))
         )
-        return found[1 : (n + 1) // 2]
+        for half in (0, 1):
+            m = np.arange(2 - half, n, 2)
+            yield m / (2 * n * self.step), found[m]
 
-    def left_by(self, colour: Colour) -> Array:
+    def left_by(self, colour: Colour, frequency_Hz: Array) -> Array:
         """(M,) of an amplitude, what a filter that makes noise of a colour as white as its white part leaves."""
         power = colour.power
         if power is None:
-            return np.ones(len(self.frequency))
+            return np.ones(len(frequency_Hz))
         own = np.arange(len(power)) / (2.0 * len(power))
-        return np.asarray(1.0 / np.sqrt(np.interp(self.frequency * self.step, own, power)))
+        return np.asarray(1.0 / np.sqrt(np.interp(frequency_Hz * self.step, own, power)))
 
 
 @dataclass(frozen=True)
@@ -102,10 +108,12 @@ def line_of_the_station(residual: Residual, time: Array) -> tuple[float, float, 
     if grid is None or residual.along is None or len(time) < (1.0 - MOST_MISSING) * grid.n:
         return None
     left = (residual.along / residual.reference_gain)[:, None]
-    spectrum = grid.spectrum(left)
-    rms = np.sqrt(2.0) * np.abs(spectrum[:, 0]) / grid.n
-    found = _largest(spectrum, left, rms, grid, 1, slow=True)
-    return (found[0].frequency_Hz, found[0].rms_nT, min(1.0, found[0].p)) if found else None
+    found: list[_Line] = []
+    for frequency, spectrum in grid.spectra(left):
+        rms = np.sqrt(2.0) * np.abs(spectrum[:, 0]) / grid.n
+        found += _largest(spectrum, left, rms, frequency, grid, 1, slow=True)
+    line = min(found, key=lambda o: o.p, default=None)
+    return (line.frequency_Hz, line.rms_nT, min(1.0, line.p)) if line else None
 
 
 def _between(residual: Residual, grid: _Grid, most: int) -> list[_Line]:
@@ -115,12 +123,14 @@ def _between(residual: Residual, grid: _Grid, most: int) -> list[_Line]:
         return []
     values, vectors = np.linalg.eigh(residual.projector)
     coordinates, colour = beside_the_field(residual.across @ vectors[:, values > 0.5], residual.affine)
-    size: Array | float = 1.0
     if not grid.even:  # what is slow would show at all frequencies, as the times scatter, in all coordinates alike
-        coordinates, size = colour.whiten(coordinates) * np.sqrt(colour.white), grid.left_by(colour)
-    spectrum = grid.spectrum(coordinates)
-    square = 2.0 * np.sum(np.abs(spectrum) ** 2, axis=1) / coordinates.shape[1]
-    return _largest(spectrum, coordinates, np.sqrt(square) / grid.n * residual.scale / size, grid, most, slow=True)
+        coordinates = colour.whiten(coordinates) * np.sqrt(colour.white)
+    lines = []
+    for frequency, spectrum in grid.spectra(coordinates):
+        square = 2.0 * np.sum(np.abs(spectrum) ** 2, axis=1) / coordinates.shape[1]
+        rms = np.sqrt(square) / grid.n * residual.scale / (1.0 if grid.even else grid.left_by(colour, frequency))
+        lines += _largest(spectrum, coordinates, rms, frequency, grid, most, slow=True)
+    return lines
 
 
 def _on_the_platform(residual: Residual, grid: _Grid, most: int) -> list[_Line]:
@@ -133,15 +143,24 @@ def _on_the_platform(residual: Residual, grid: _Grid, most: int) -> list[_Line]:
     colour = colour_of(residual.along)
     # what is slow, a drift of the base station, would turn with the direction
     left = colour.whiten(residual.along) * np.sqrt(colour.white) / residual.reference_gain
-    spectrum = grid.spectrum(left[:, None] * direction)
     shown = np.linalg.pinv(direction.T @ direction / len(direction), rcond=_LEAST_TURNED, hermitian=True)
-    square = 2.0 * np.einsum("mi,ij,mj->m", spectrum.conj(), shown, spectrum).real
-    rms = np.sqrt(np.maximum(square, 0.0)) / grid.n / grid.left_by(colour)
-    return _largest(spectrum, left[:, None] * direction, rms, grid, most)
+    lines = []
+    for frequency, spectrum in grid.spectra(left[:, None] * direction):
+        square = 2.0 * np.einsum("mi,ij,mj->m", spectrum.conj(), shown, spectrum).real
+        rms = np.sqrt(np.maximum(square, 0.0)) / grid.n / grid.left_by(colour, frequency)
+        lines += _largest(spectrum, left[:, None] * direction, rms, frequency, grid, most)
+    return lines
 
 
 def _largest(
-    spectrum: NDArray[np.complex128], coordinates: Array, rms_nT: Array, grid: _Grid, most: int, *, slow: bool = False
+    spectrum: NDArray[np.complex128],
+    coordinates: Array,
+    rms_nT: Array,
+    frequency_Hz: Array,
+    grid: _Grid,
+    most: int,
+    *,
+    slow: bool = False,
 ) -> list[_Line]:
     """The strongest peaks of a spectrum (M, K) of coordinates (N, K) over its running median; among them, if asked for,
     slow ones, judged by as few frequencies beside them as there are, and as if the coordinates shared one series: what
@@ -160,24 +179,24 @@ def _largest(
         beside = i // 2
         over = power[i] / max(float(np.median(power[i - beside : i + beside + 1])), 1e-300) * np.log(2.0)
         p[i] = fdtrc(2, 2 * _OF_A_MEDIAN * (2 * beside + 1), over)
-    frequency = grid.frequency
     lines: list[_Line] = []
     for i in np.lexsort((-ratio, p)):
         if len(lines) == most:
             break
-        if any(abs(frequency[i] - other.frequency_Hz) < _BESIDE / (grid.n * grid.step) for other in lines):
+        if any(abs(frequency_Hz[i] - other.frequency_Hz) < _BESIDE / (grid.n * grid.step) for other in lines):
             continue
-        lines.append(_Line(float(frequency[i]), float(rms_nT[i]), float(p[i]) * len(power)))
+        lines.append(_Line(float(frequency_Hz[i]), float(rms_nT[i]), float(p[i]) * 2 * len(power)))
     return lines
 
 
 def _of_a_grid(coordinates: Array, places: Array, n: int) -> NDArray[np.complex128]:
-    """(n // 2 + 1, K) Fourier transform of coordinates (N, K) at places of a grid, between which they are straight."""
+    """(n + 1, K) Fourier transform of coordinates (N, K) at places of a grid, between which they are straight, at every
+    half period in it."""
     from scipy.fft import rfft
 
     if n > len(places):
         coordinates = np.column_stack([np.interp(np.arange(float(n)), places, column) for column in coordinates.T])
-    return np.asarray(rfft(coordinates, axis=0))
+    return np.asarray(rfft(coordinates, n=2 * n, axis=0))
 
 
 def transform(coordinates: Array, places: Array, n: int) -> NDArray[np.complex128]:
