@@ -38,6 +38,7 @@ from magtensor.loop.remainder.outlying import Outlying, outlying_words, spike_wo
 from magtensor.loop.remainder.predictable import attitude_words, converter_words, shortened_words
 from magtensor.loop.remainder.sparse_readings import SparseReadings, sparse_readings
 from magtensor.loop.remainder.tones import of_the_turning
+from magtensor.loop.remainder.turned_too_far import turned_too_far_words
 from magtensor.loop.searching.found import Search
 from magtensor.loop.searching.latent import shared_words
 from magtensor.loop.searching.like_a_station import channels_of_the_total_field, turns_with_the_platform
@@ -129,6 +130,7 @@ def _what_shows(found: Search, record: Record, excess: float, sparse: SparseRead
     )
     predictable = following or converter_words(state)
     words.extend(predictable)
+    words.extend([] if predictable else turned_too_far_words(state))
     words.extend(shortened_words(state))
     # a field that turns sweeps through a law that it lacks, and what trembles has a line and not another time
     words.extend([] if predictable or line is not None else jitter_words(state))
