@@ -10,6 +10,10 @@ from magtensor.calibration.types import Array
 
 COMPONENTS = ("xx", "xy", "xz", "yy", "yz", "zz")
 _INDEX = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+_FREE = 3 + len(_INDEX)  # of what |b| tells of a sensor's calibration
+_STEPS = 20
+_SETTLED = 1e-3  # of the sum of squares
+_SHOWN = 1e-4  # of the largest singular value: noise of an axis that is never used would be taken for a direction
 
 
 def figure(value: float) -> str:
@@ -54,24 +58,42 @@ def error_block(
 
 
 def left_by_any_calibration(b: Array, total_field: Array, good: np.ndarray) -> float | None:
-    """nT rms of |b| - F that no other offsets and matrices of the sensors take off, to first order; None of nothing.
+    """nT rms of |b| - F that no other offsets and matrices of the sensors take off; None of nothing.
 
     A survey that disagrees with a calibration for what this leaves has noise or a disturbance of its own.
 
     Args:
-        b: (N, S, 3) nT calibrated; total_field: (N,) nT; good: (N, S) samples in use.
+        b: (N, S, 3) nT calibrated, however badly; total_field: (N,) nT; good: (N, S) samples in use.
     """
     left = []
     for sensor in range(b.shape[1]):
-        own, residual = b[:, sensor], np.linalg.norm(b[:, sensor], axis=1) - total_field
-        use = good[:, sensor] & np.isfinite(residual)
-        unit = own[use] / np.linalg.norm(own[use], axis=1, keepdims=True)
-        products = [unit[:, i] * unit[:, j] for i in range(3) for j in range(i, 3)]
-        columns = np.column_stack([unit, *products])
-        if len(columns) > columns.shape[1]:
-            free = np.linalg.lstsq(columns, residual[use], rcond=1e-9)[0]
-            left.append(residual[use] - columns @ free)
+        use = good[:, sensor] & np.isfinite(total_field) & np.isfinite(b[:, sensor]).all(axis=1)
+        if np.count_nonzero(use) > _FREE:
+            left.append(_left_of_one(b[use, sensor], total_field[use]))
     return rms(np.concatenate(left)) if left else None
+
+
+def _left_of_one(own: Array, total_field: Array) -> Array:
+    """(N,) nT, |b| - F of one sensor's vectors (N, 3) after the best linear correction, by Gauss-Newton steps."""
+    left = np.linalg.norm(own, axis=1) - total_field
+    size = float(np.mean(total_field))
+    for _ in range(_STEPS):
+        unit = own / np.linalg.norm(own, axis=1, keepdims=True)
+        products = [own[:, i] * unit[:, j] / size for i, j in _INDEX]
+        free = np.linalg.lstsq(np.column_stack([unit, *products]), left, rcond=_SHOWN)[0]
+        matrix = np.zeros((3, 3))
+        for value, (i, j) in zip(free[3:], _INDEX, strict=True):
+            matrix[i, j] += value / (2.0 * size)
+            matrix[j, i] += value / (2.0 * size)
+        own = own - free[:3] - own @ matrix
+        after = np.linalg.norm(own, axis=1) - total_field
+        gained = float(np.sum(left**2) - np.sum(after**2))
+        if not gained > 0:
+            break
+        left = after
+        if gained < _SETTLED * np.sum(left**2):
+            break
+    return left
 
 
 def rms(values: Array) -> float | None:

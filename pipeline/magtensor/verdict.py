@@ -202,6 +202,7 @@ def _disagreement(outcome: dict[str, Any]) -> str:
         )
     if left > DISAGREES * here["all"]:
         too = ", or what is unexplained here too" if outcome["unexplained"]["present"] else ""
+        too += ", or an effect by another law than was added" if outcome["adopted"] else ""
         too += f", or what an effect comes to beyond what is known of it{'' if words else beyond}" if beyond else ""
         words += (
             f"; the verification survey has {figure(left)} nT rms of |b| - F{where} that no calibration would take "

@@ -176,7 +176,11 @@ def test_a_site_that_was_modelled_is_in_another_survey_too(kind: str, words: str
         ((2.0, 3.0), None, "does not carry over (channel_response: pressure"),
         ((0.6, 0.55), None, "the law may be another one (channel_response: pressure"),
         ((5.0, 3.0), 0.2, "too little of what the second needs (channel_response: pressure"),
-        ((5.0, 3.0), 2.9, "its own, or what an effect comes to beyond what is known of it (channel_response: pressure"),
+        (
+            (5.0, 3.0),
+            2.9,
+            "was added, or what an effect comes to beyond what is known of it (channel_response: pressure",
+        ),
     ],
 )
 def test_an_effect_beyond_what_is_known_of_it_may_be_why_another_survey_disagrees(

@@ -176,7 +176,7 @@ def why_not(record: Record, before: Trial, after: Trial, chosen: Candidate, how:
             return f"a curve of {channel} explains most of it: what is adopted may miss its law"
         terms = chosen.terms.only(i for i, s in enumerate(chosen.terms.sensors) if s in acts_on)
         if channel := channel_instead(seen, terms, chosen.assessment.colours, min(moments(model))):
-            return f"C of {', '.join(acts_on)} follows {channel}, which explains more than something that happens once"
+            return f"C of {', '.join(acts_on)} going with {channel} would explain more than something that happens once"
         if better_left_out(record, before.state, after.state, which, how):
             return "fitted, its samples are far from its law: the others are fitted better without them"
     return ""
