@@ -10,26 +10,50 @@ from pydantic import Field
 from magtensor.calibration.types import Array
 from magtensor.components import error_model
 from magtensor.error_models.excitation import Excitation
+from magtensor.error_models.independent import independent
 from magtensor.error_models.settings import Delays
 from magtensor.error_models.terms import Terms, joined
 from magtensor_effects.ageing import EventTime, Law, OneTime, Order, OtherTime, Span, courses
 
 MOST_EXCESS = 0.75  # of the recorded variation: four times that of the site
+BY_CHANCE = 0.01  # probability; noise that is as strong as the variation is rare by itself
+LEAST_FREEDOM = 3.0  # of a steady variation none is left, and a drift of the base station is its rival
 NEARBY_S = 2.0  # shorter delays show as the slope over this time
 LONGEST_S = 7200.0  # two time zones
 BETWEEN_NOISE_AND_DELAY = 0.75  # of the lag: half of it is what noise makes, all of it a delay
 
 
-def _more_than_noise(_: Excitation, __: Mapping[str, Any], coefficients: Array, explained: float) -> bool:
+def _more_than_noise(x: Excitation, _: Mapping[str, Any], coefficients: Array, explained: float) -> bool:
     """Whether an excess of the recorded variation explains more than it would if it were noise of the base station.
 
     Noise w beside a variation v is recorded and not seen at the site: the excess is fitted as k = w^2 / (v^2 + w^2) and
     explains the share k of the residual, which is w, whatever the weights; a true excess explains all that is not of
     the sensors. Half way between is sqrt(k), and twice the share is beyond the chance likeness of v and w; near 1 the
-    two are one.
+    two are one. Where both are slow chance makes them more alike: k and the share say how much w would be correlated
+    with v, and that has to be beyond what it is between courses of so few independent values.
     """
     excess = 0.01 * float(coefficients[0])
-    return excess <= 0.0 or (excess < MOST_EXCESS and explained > min(np.sqrt(excess), 2.0 * excess))
+    if excess <= 0.0:
+        return True
+    if excess >= MOST_EXCESS or explained <= min(np.sqrt(excess), 2.0 * excess):
+        return False
+    return explained >= 1.0 or _correlation_of_noise(excess, explained) > _by_chance(independent(x.reference))
+
+
+def _correlation_of_noise(excess: float, explained: float) -> float:
+    """Between noise of the base station and the variation, if that were all that the excess is."""
+    noise = excess**2 / explained  # its variance and that of the variation, in units of the recorded variation's
+    variation = 1.0 - 2.0 * excess + noise
+    return float((excess - noise) / np.sqrt(max(noise * variation, 1e-300)))
+
+
+def _by_chance(independent_values: float) -> float:
+    """A correlation that so many independent values have by chance with a probability `BY_CHANCE`."""
+    from scipy.special import stdtrit
+
+    freedom = max(independent_values - 2.0, LEAST_FREEDOM)
+    t = float(stdtrit(freedom, 1.0 - BY_CHANCE))
+    return t / float(np.hypot(t, np.sqrt(freedom)))
 
 
 @error_model(

@@ -18,6 +18,7 @@ from magtensor.calibration.joint import calibrated
 from magtensor.calibration.types import Array
 from magtensor.components import Component
 from magtensor.error_models.direction import attitude_series, curve_series
+from magtensor.error_models.independent import independent
 from magtensor.error_models.terms import joined
 from magtensor.error_models.waveform import NAME, Course, course_of, free_directions
 from magtensor.loop.correcting.correction import hidden_objection
@@ -49,7 +50,6 @@ from magtensor.loop.searching.likeness import (
     followed,
     followed_by_a_curve,
     held_out_losses,
-    independent,
     of_an_unseen_path,
 )
 

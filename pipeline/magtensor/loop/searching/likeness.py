@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from magtensor.calibration.types import Array
 from magtensor.error_models.curves import along_a_curve, bends_of
+from magtensor.error_models.independent import independent
 from magtensor.error_models.terms import Terms
 from magtensor.error_models.waveform import NAME, free_directions
 from magtensor.loop.evidence.folds import FOLDS
@@ -158,15 +159,6 @@ def _comes_and_goes(course: Array) -> bool:
     """Whether a course crosses its mean so often that another one hardly does so at the same times."""
     above = course > course.mean()
     return independent(course) > FEW and int(np.count_nonzero(above[1:] != above[:-1])) > FEW
-
-
-def independent(waveform: Array) -> float:
-    """How many independent values a waveform (N,) amounts to: of sines and cosines with as much power each, so many;
-    0 of one that is constant."""
-    from scipy.fft import rfft
-
-    power = np.abs(rfft(waveform - waveform.mean())) ** 2
-    return float(2.0 * power.sum() ** 2 / max(np.sum(power**2), 1e-300))
 
 
 def _left_by(course: Array, values: Array) -> float:

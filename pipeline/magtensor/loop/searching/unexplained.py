@@ -123,7 +123,8 @@ def _what_shows(found: Search, record: Record, excess: float, sparse: SparseRead
         words.append(f"a line at {line[0]:.4g} Hz (period {1 / line[0]:.4g} s), {line[1]:.3g} nT rms{too}")
     elif _seen_alike(state.residual):
         alone = line_of_the_station(state.residual, record.time[state.residual.samples])
-        if alone is not None and alone[2] < ALPHA and alone[1] ** 2 >= OF_A_LINE * excess**2:
+        least = max(OF_A_LINE * excess**2, sparse.between**2 if sparse is not None else 0.0)  # or made between readings
+        if alone is not None and alone[2] < ALPHA and alone[1] ** 2 >= least:
             words.append(f"a line of |b| - F at {alone[0]:.4g} Hz (period {1 / alone[0]:.4g} s), {alone[1]:.3g} nT rms")
     following, changing = shared_out(
         lambda of: of(state), [attitude_words, lambda state: [m.words for m in changing_matrices(state, ALPHA)]]
