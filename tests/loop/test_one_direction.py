@@ -51,6 +51,18 @@ def test_iron_shows_the_field_and_heat_one_direction(seed: int, iron: bool, sens
     assert of_one_direction(joint_state(record, [model], Fitting()), 0) is not iron
 
 
+@pytest.mark.parametrize("seed", [10, 20])
+def test_iron_in_a_short_survey_of_slow_turns_is_iron(seed: int) -> None:
+    """Of four time constants, in which the field has hardly more than one direction that is late."""
+    rng = np.random.default_rng(seed)
+    plain = synthetic(seed, samples=180, noise_nT=0.2, turning_s=15.0)
+    u = plain.raw.mean(axis=1) - plain.raw.mean(axis=(0, 1))
+    u /= np.linalg.norm(u, axis=1)[:, None]
+    added = np.einsum("sij,nj->nsi", 4.0 * rng.standard_normal((4, 3, 3)), late(u) - u)
+    model = Adopted(Registry.load().find("error_model", "viscous_magnetisation"), SETTLED)
+    assert not of_one_direction(joint_state(replace(plain, raw=plain.raw + added), [model], Fitting()), 0)
+
+
 def test_what_one_direction_leaves_of_matrices() -> None:
     rng = np.random.default_rng(2)
     k, w = rng.standard_normal((4, 3)), rng.standard_normal(3)

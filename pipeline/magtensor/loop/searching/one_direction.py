@@ -20,14 +20,14 @@ from magtensor.loop.searching.contribution import put_back, slices
 
 VISCOUS = "viscous_magnetisation"
 CHANCE = 0.01  # probability that noise alone makes the other directions explain as much
-HALF = 0.5  # of what matrices without any order would leave beside one direction
+A_FIFTH = 0.2  # of what matrices without any order would leave beside one direction
 _ROUNDS = 50
 _DRAWS = 30
 
 
 def of_one_direction(state: State, which: int) -> bool:
     """Whether one direction of the lagged field explains what an adopted model with a matrix for each sensor does: all
-    but what chance makes of the others, or half of what is left of matrices whose entries are alike at random."""
+    but what chance makes of the others, or a fifth of what is left of matrices whose entries are alike at random."""
     from scipy.special import chdtri
 
     assert state.terms is not None
@@ -40,7 +40,7 @@ def of_one_direction(state: State, which: int) -> bool:
     lost = beside_one_direction(matrices, information)
     freedom = 9 * len(matrices) - (3 * len(matrices) + 2)
     least = float(chdtri(freedom, CHANCE))
-    return lost < max(least, HALF * left_by_chance(matrices, information) * float(theta @ information @ theta))
+    return lost < max(least, A_FIFTH * left_by_chance(matrices, information) * float(theta @ information @ theta))
 
 
 def beside_one_direction(matrices: Array, information: Array) -> float:
