@@ -7,7 +7,8 @@ is no evidence of a tone, unless it is larger than any such law would make it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Collection, Sequence
 
 import numpy as np
 
@@ -24,12 +25,16 @@ LARGEST_LAW = 0.01  # of the field, that a law of the attitude makes of an attit
 
 
 def tones(state: State, time: Array) -> tuple[float, ...]:
-    """Hz of the strongest lines that noise does not make and that are no more than likely the turning's, `time` being
-    that of all samples. No test of a tone by itself would know that it was taken from a thousand frequencies."""
+    """Hz of the strongest lines that noise does not make and that are no more than likely the turning's, or of the law
+    of an adopted model that follows a channel with such a line, `time` being that of all samples. No test of a tone by
+    itself would know that it was taken from a thousand frequencies."""
+    x = state.excitation
     lines = spectral_lines(state.residual, time[state.residual.samples], most=2 * MOST)
     lines = [line for line in lines if line[2] < CHANCE]
-    theirs = of_the_turning(state.excitation, [f for f, _, _ in lines], [rms for _, rms, _ in lines])
-    return tuple(f for (f, _, _), its in zip(lines, theirs, strict=True) if not its)[:MOST]
+    theirs = of_the_turning(x, [f for f, _, _ in lines], [rms for _, rms, _ in lines])
+    followed = {name for model in state.adopted for name in model.channels(x)}
+    left = (f for (f, _, _), its in zip(lines, theirs, strict=True) if not its)
+    return tuple(itertools.islice((f for f in left if not channels_of_the_line(x, f, followed)), MOST))
 
 
 def of_the_turning(x: Excitation, frequencies_Hz: Sequence[float], rms_nT: Sequence[float]) -> list[bool]:
@@ -40,13 +45,17 @@ def of_the_turning(x: Excitation, frequencies_Hz: Sequence[float], rms_nT: Seque
     return [own < largest for own, largest in zip(amplitudes, most.tolist(), strict=True)]
 
 
-def channels_of_the_line(x: Excitation, frequency_Hz: float) -> tuple[str, ...]:
-    """Logged channels with a line at a frequency, or with a power that has one: what follows such a channel, late or by
-    a law of its own, is not told from a tone."""
+def channels_of_the_line(x: Excitation, frequency_Hz: float, among: Collection[str] | None = None) -> tuple[str, ...]:
+    """Logged channels, all or some, with a line at a frequency, or with a power that has one, or a law with a corner or
+    a step: what follows such a channel, late or by a law of its own, is not told from a tone."""
     found = []
     for name, values in sorted(x.logged.items()):
+        if among is not None and name not in among:
+            continue
         course = (values - values.mean(axis=0)) / np.maximum(values.std(axis=0), 1e-300)
-        powers = np.column_stack([course.reshape(len(course), -1) ** k for k in range(1, HARMONICS + 1)])
-        if largest_lines(powers, x, [frequency_Hz])[0] > 0:
+        each = course.reshape(len(course), -1)
+        size = np.linalg.norm(values.reshape(len(course), -1), axis=1)
+        laws = [*(each**k for k in range(1, HARMONICS + 1)), np.abs(each), np.sign(each), size]
+        if largest_lines(np.column_stack(laws), x, [frequency_Hz])[0] > 0:
             found.append(name)
     return tuple(found)

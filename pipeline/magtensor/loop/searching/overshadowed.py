@@ -7,7 +7,8 @@ quadratic nonlinearity. So an adopted effect that follows the attitude and expla
 taken out again. So is a tone that may be a harmonic of how the platform turns; and so is what happened once, where more
 of the kind beside it is significant and predicts nothing, as where a sensor wanders, or where the sensors share a
 waveform that has no name and is larger, or switches along the same vectors: a step or a passage may be a part of it,
-or where nearly all that is left out of the calibration lies along its vector;
+or where nearly all that is left out of the calibration lies along its vector; so are tones close to each other along
+one vector, the sidebands of one whose strength or frequency changes;
 and a source that nobody logged, whose waveform may be a small part of any law that has no name. And whatever is larger,
 an effect with which held-out blocks are predicted worse than without it, once no noise is weighed against another, was
 one of a few samples that the colour of the noise made much of.
@@ -16,6 +17,7 @@ one of a few samples that the colour of the noise made much of.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,6 +48,8 @@ NAMELESS = 2.0  # times what stays, that a response to a logged vector explains 
 LONE = 2  # events along one vector may be all that happened, where nothing stays
 ALONG = 0.95  # cosine, with a source's vector or another event's; of one sensor 5 % of all directions are as near
 AS_MUCH = 0.25  # of an event, that it may differ by from what it is at another time
+SIDEBANDS = 3  # tones along one vector, and no two of them harmonics of what is between them
+CLOSE = 1.5  # times the lowest of their frequencies; the second and third harmonic are as far apart
 HARMONICS = 16  # of the turning, that a law of the attitude with a corner shows
 
 
@@ -54,7 +58,8 @@ def overshadowed(found: Search, fixed: int) -> tuple[list[int], str] | None:
     adopted, and why it is doubted."""
     state, left = found.told, staying(found)
     weakest: tuple[float, list[int], str] | None = None
-    if (part := _of_an_adopted_source(state, fixed) or of_what_is_left_out(found, fixed)) is not None:
+    part = _of_an_adopted_source(state, fixed) or of_what_is_left_out(found, fixed) or _of_one_tone(state, fixed)
+    if part is not None:
         return part
     for places in _of_one_name(state, fixed):
         before, after = without_and_with(found, *places)
@@ -201,6 +206,40 @@ def _of_one_that_switches(state: State, fixed: int) -> tuple[list[int], str] | N
     return None
 
 
+def _of_one_tone(state: State, fixed: int) -> tuple[list[int], str] | None:
+    """Several tones close to each other along one vector, and no harmonics: one whose strength or frequency changes, in
+    another survey otherwise."""
+    x = state.excitation
+    tones = [
+        (i, f, _phased_vector(state, i)) for i, a in enumerate(state.adopted) if i >= fixed and (f := _frequency(a))
+    ]
+    for _, lowest, first in tones:
+        along = [(i, f) for i, f, v in tones if _along(v, first)]
+        close = [(i, f) for i, f in along if lowest <= f < CLOSE * lowest]
+        own = [(i, f) for i, f in close if not any(_harmonic(f, g, float(x.elapsed[-1])) for _, g in along)]
+        if len(own) >= SIDEBANDS:
+            each = ", ".join(f"{f:.4g}" for f in sorted(f for _, f in own))
+            return [
+                i for i, _ in own
+            ], f"tones at {each} Hz go along one vector: one whose strength or frequency changes"
+    return None
+
+
+def _harmonic(frequency_Hz: float, other_Hz: float, survey_s: float) -> bool:
+    """Whether a frequency is a multiple of another one, as well as a survey tells."""
+    times = round(frequency_Hz / other_Hz)
+    return times > 1 and abs(frequency_Hz - times * other_Hz) * survey_s < 1.0
+
+
+def _phased_vector(state: State, place: int) -> NDArray[np.complex128]:
+    """(3 S,) nT, of an adopted tone: what goes with its cosine, and with its sine as the imaginary part."""
+    terms = state.adopted[place].terms(state.excitation)
+    vector = np.zeros(3 * len(state.excitation.sensors), dtype=complex)
+    each = terms.part_weight * state.theta[place][terms.part_term] * np.where(terms.part_series == 0, 1.0, 1.0j)
+    np.add.at(vector, terms.part_output, each)
+    return vector
+
+
 def _vector(state: State, place: int) -> Array | None:
     """(3 S,) nT for a unit of the one series of an adopted model, by which it moves each output; None where it has
     several series."""
@@ -213,10 +252,10 @@ def _vector(state: State, place: int) -> Array | None:
     return vector if vector.any() else None
 
 
-def _along(one: Array, other: Array) -> bool:
+def _along(one: NDArray[Any], other: NDArray[Any]) -> bool:
     """Whether a vector lies along another one, in the outputs that it moves."""
     seen = np.where(one != 0.0, other, 0.0)
-    return abs(float(one @ seen)) > ALONG * float(np.linalg.norm(one) * np.linalg.norm(seen))
+    return abs(np.vdot(one, seen)) > ALONG * float(np.linalg.norm(one) * np.linalg.norm(seen))
 
 
 def _part_of_a_source(found: Search, fixed: int) -> tuple[list[int], str] | None:

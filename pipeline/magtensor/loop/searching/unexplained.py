@@ -37,7 +37,7 @@ from magtensor.loop.remainder.loud import Loud
 from magtensor.loop.remainder.outlying import Outlying, outlying_words, spike_words
 from magtensor.loop.remainder.predictable import attitude_words, converter_words, shortened_words
 from magtensor.loop.remainder.sparse_readings import SparseReadings, sparse_readings
-from magtensor.loop.remainder.tones import of_the_turning
+from magtensor.loop.remainder.tones import channels_of_the_line, of_the_turning
 from magtensor.loop.remainder.turned_too_far import turned_too_far_words
 from magtensor.loop.searching.found import Search
 from magtensor.loop.searching.latent import shared_words
@@ -118,8 +118,9 @@ def _what_shows(found: Search, record: Record, excess: float, sparse: SparseRead
     line = strongest_line(state, record)
     # where the platform turns steadily, what is no tone has a small line too
     if line is not None and line[1] ** 2 >= OF_A_LINE * excess**2:
-        turning = of_the_turning(state.excitation, line[:1], line[1:])[0]
-        too = ", where the platform's turning has one too" if turning else ""
+        theirs = list(channels_of_the_line(state.excitation, line[0]))
+        theirs += ["the platform's turning"] * of_the_turning(state.excitation, line[:1], line[1:])[0]
+        too = f", where {' and '.join(theirs)} {'has' if len(theirs) == 1 else 'have'} one too" if theirs else ""
         words.append(f"a line at {line[0]:.4g} Hz (period {1 / line[0]:.4g} s), {line[1]:.3g} nT rms{too}")
     elif _seen_alike(state.residual):
         alone = line_of_the_station(state.residual, record.time[state.residual.samples])
