@@ -161,4 +161,4 @@ def test_a_mount_that_turns_with_temperature_has_not_jumped(jumps: bool) -> None
     assert [a.name for a in found.last.adopted] == ["turn_step"] * jumps
     told = unexplained(found, record)
     assert ("C of S2 is not constant" in told["description"]) is not jumps
-    assert any("C of S2 follows temperature" in why for s in found.steps for why in s.refused.values()) is not jumps
+    assert any("C of S2 going with temperature" in why for s in found.steps for why in s.refused.values()) is not jumps
