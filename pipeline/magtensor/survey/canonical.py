@@ -73,13 +73,13 @@ def survey_from(tables: Tables) -> Survey:
             )
     time, epoch = _time(tables.find("time"))
     raw = tables.find("b_raw")
-    if len(raw.shape) == 3 and raw.shape[2] == 3 and raw.shape[0] != len(time):
+    if len(raw.shape) == 3 and raw.shape[2] == 3 and len(time) not in raw.shape:  # else it is another order
         raise DataError(
             f"time has {len(time)} values, and b_raw has {raw.shape[0]} samples",
             where=tables.where,
             hint="every sample has a time of its own, in the same row",
         )
-    if len(raw.shape) != 3 or raw.shape[2] != 3:
+    if len(raw.shape) != 3 or raw.shape[0] != len(time) or raw.shape[2] != 3:
         raise DataError(
             f"shape {raw.shape} is not (time, sensor, axis) = ({len(time)}, sensors, 3)",
             where=raw.origin,
