@@ -24,20 +24,21 @@ BETWEEN_NOISE_AND_DELAY = 0.75  # of the lag: half of it is what noise makes, al
 
 
 def _more_than_noise(x: Excitation, _: Mapping[str, Any], coefficients: Array, explained: float) -> bool:
-    """Whether an excess of the recorded variation explains more than it would if it were noise of the base station.
+    """Whether an excess of the recorded variation, or a lack, explains more than noise of the base station would.
 
     Noise w beside a variation v is recorded and not seen at the site: the excess is fitted as k = w^2 / (v^2 + w^2) and
     explains the share k of the residual, which is w, whatever the weights; a true excess explains all that is not of
     the sensors. Half way between is sqrt(k), and twice the share is beyond the chance likeness of v and w; near 1 the
-    two are one. Where both are slow chance makes them more alike: k and the share say how much w would be correlated
-    with v, and that has to be beyond what it is between courses of so few independent values.
+    two are one. Where both are slow chance makes them alike or opposite, and k negative if opposite: k and the share
+    say how much w would be correlated with v, and that has to be beyond what it is between courses of so few
+    independent values.
     """
     excess = 0.01 * float(coefficients[0])
-    if excess <= 0.0:
-        return True
-    if excess >= MOST_EXCESS or explained <= min(np.sqrt(excess), 2.0 * excess):
+    if explained <= 0.0 or excess >= MOST_EXCESS:
         return False
-    return explained >= 1.0 or _correlation_of_noise(excess, explained) > _by_chance(independent(x.reference))
+    if excess > 0.0 and explained <= min(np.sqrt(excess), 2.0 * excess):
+        return False
+    return explained >= 1.0 or abs(_correlation_of_noise(excess, explained)) > _by_chance(independent(x.reference))
 
 
 def _correlation_of_noise(excess: float, explained: float) -> float:
