@@ -231,8 +231,13 @@ def test_sets_of_terms_are_scored_together_as_each_is_alone() -> None:
     for adopted in (None, given):
         for colours in (Colours(WHITE, WHITE), colours_of(residual)):
             score = Scorer(residual, adopted, colours)
+            alone = None if adopted is None else estimated(residual, adopted, colours)
             for terms, found in zip(several, score.of_each(several), strict=True):
                 every = [terms] if adopted is None else [adopted, terms]
                 estimate = estimated(residual, joined(every), colours)
-                beyond = explained(estimate) - score.own
-                assert found == pytest.approx(rarity(beyond, min(estimate.rank, terms.count)), rel=1e-6)
+                beyond, rank = (
+                    (explained(estimate), estimate.rank)
+                    if alone is None
+                    else (explained(estimate) - explained(alone), estimate.rank - alone.rank)
+                )
+                assert found == pytest.approx(rarity(beyond, rank), rel=1e-6)

@@ -169,10 +169,20 @@ def own_information_of_each(g: Grams) -> Array:
     return out
 
 
-def explained_by_each(g: Grams) -> tuple[Array, NDArray[np.int_]]:
-    """(B,) reduction of the sum of squares by all terms of each block or set, in noise of unit variance, and (B,) how
-    many directions are identifiable."""
-    n, y = normal(g)
-    root = np.sqrt(np.maximum(own_information_of_each(g), 1e-300))
-    values, _, shown = _directions_of_each(n, y, Own(root[0] ** 2, g.pieces.noise), root)
+def explained_beside_each(g: Grams, known: Estimate | None) -> tuple[Array, NDArray[np.int_]]:
+    """(B,) reduction of the sum of squares by the terms of each block or set beside those that come first and are the
+    same in all, in noise of unit variance, and (B,) how many directions are identifiable beside them.
+
+    Parameters
+    ----------
+    known: the coefficients of those that come first, estimated without the others; None where there are none.
+    """
+    first = 0 if known is None else len(known.theta)
+    n, y = normal(g, first)
+    if known is not None:
+        mixed = n[:, :first].swapaxes(1, 2)
+        y = y - mixed @ known.theta
+        n = n[:, first:] - mixed @ known.covariance @ n[:, :first]
+    root = np.sqrt(np.maximum(own_information_of_each(g)[:, first:], 1e-300))
+    values, _, shown = _directions_of_each(n, y, Own(root[0] ** 2, g.pieces.noise[first:]), root)
     return np.sum(shown**2 / values, axis=1), np.isfinite(values).sum(axis=1)

@@ -313,41 +313,52 @@ def _grams(
     )  # fmt: skip
 
 
-def normal(g: Grams) -> tuple[Array, Array]:
-    """Normal matrix (B, P, P) and right side (B, P) of the terms for each set, the fit's own freedom projected off."""
+def normal(g: Grams, first: int = 0) -> tuple[Array, Array]:
+    """Normal matrix (B, P, P) and right side (B, P) of the terms for each set, the fit's own freedom projected off.
+
+    Parameters
+    ----------
+    first: of the coefficients that are asked for, those before it known already: the columns (B, P, P - first) of them.
+    """
     batch = len(g.zz)
-    n = np.zeros((batch, g.count, g.count))
-    y = np.zeros((batch, g.count))
-    if len(g.pieces.term) and g.zz.any():
-        most = max(ENTRIES // len(g.pieces.term) ** 2, 1)
-        for first in range(0, batch, most):
-            _add_across(g, slice(first, first + most), n, y)
+    n = np.zeros((batch, g.count, g.count - first))
+    y = np.zeros((batch, g.count - first))
+    asked = g.pieces.term >= first
+    if asked.any() and g.zz.any():
+        most = max(ENTRIES // (len(asked) * int(asked.sum())), 1)
+        for begin in range(0, batch, most):
+            _add_across(g, slice(begin, begin + most), int(np.argmax(asked)), n, y)
     if g.aa.any():
         m = g.own
         own = _inverse((g.aa[:1] if g.one_survey else g.aa)[:, :m, :m])
-        mixed = g.aa[:, :m, m:]
-        turned = np.swapaxes(mixed, 1, 2) @ own
-        n += g.aa[:, m:, m:] - turned @ mixed
-        y += g.ar[:, m:] - (turned @ g.ar[:, :m, None])[:, :, 0]
+        mixed, known = g.aa[:, :m, m + first :], g.aa[:, :m, m:]
+        turned = own @ mixed
+        n += g.aa[:, m:, m + first :] - known.swapaxes(1, 2) @ turned
+        y += g.ar[:, m + first :] - (turned.swapaxes(1, 2) @ g.ar[:, :m, None])[:, :, 0]
     return n, y
 
 
-def _add_across(g: Grams, sets: slice, n: Array, y: Array) -> None:
-    """Add what some of the sets know across to all normal matrices (B, P, P) and right sides (B, P)."""
-    zd, ze, pieces = g.zd[sets], g.ze[sets], g.pieces
-    solve = np.linalg.solve(g.zz[:1] if g.one_survey else g.zz[sets], np.concatenate([zd, ze], axis=2))
-    k, s = g.dd.shape[1], pieces.series
-    t = g.dd[sets] - np.swapaxes(zd, 1, 2) @ solve[:, :, :k]
-    c = g.de[sets] - np.swapaxes(zd, 1, 2) @ solve[:, :, k:]
-    parts = t[:, s[:, None], s[None, :]] * pieces.shown
-    found = np.einsum("bro,ro->br", c[:, s], pieces.across)
-    starts = np.flatnonzero(np.diff(pieces.term, prepend=-1))  # the pieces are in the order of the terms
-    if len(starts) < len(pieces.term):
-        parts = np.add.reduceat(np.add.reduceat(parts, starts, axis=1), starts, axis=2)
-        found = np.add.reduceat(found, starts, axis=1)
+def _add_across(g: Grams, sets: slice, first: int, n: Array, y: Array) -> None:
+    """Add what some of the sets know across, of the pieces from a number on, to all normal matrices (B, P, p) and right
+    sides (B, p); the pieces and their series are in the order of the terms."""
+    zd, pieces, series = g.zd[sets], g.pieces, g.pieces.series
+    begin = int(series[first:].min())
+    zd_asked, k = zd[:, :, begin:], g.dd.shape[1] - begin
+    solve = np.linalg.solve(g.zz[:1] if g.one_survey else g.zz[sets], np.concatenate([zd_asked, g.ze[sets]], axis=2))
+    t = g.dd[sets][:, :, begin:] - np.swapaxes(zd, 1, 2) @ solve[:, :, :k]
+    c = g.de[sets][:, begin:] - np.swapaxes(zd_asked, 1, 2) @ solve[:, :, k:]
+    asked = series[first:] - begin
+    parts = t[:, series[:, None], asked[None, :]] * pieces.shown[:, first:]
+    found = np.einsum("bro,ro->br", c[:, asked], pieces.across[first:])
+    starts = np.flatnonzero(np.diff(pieces.term, prepend=-1))
     own = pieces.term[starts]
-    n[sets, own[:, None], own] += parts
-    y[sets, own] += found
+    starts_asked = starts[starts >= first] - first
+    own_asked = pieces.term[first:][starts_asked] - (n.shape[1] - n.shape[2])
+    if len(starts) < len(pieces.term):
+        parts = np.add.reduceat(np.add.reduceat(parts, starts, axis=1), starts_asked, axis=2)
+        found = np.add.reduceat(found, starts_asked, axis=1)
+    n[sets, own[:, None], own_asked] += parts
+    y[sets, own_asked] += found
 
 
 def _inverse(information: Array) -> Array:

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from math import lgamma, log
 
 from magtensor.error_models.terms import Terms
-from magtensor.loop.evidence.assessment import Colours, estimated_in, explained
+from magtensor.loop.evidence.assessment import Colours, estimated_in
 from magtensor.loop.evidence.columns import Made
-from magtensor.loop.evidence.estimate import explained_by_each
+from magtensor.loop.evidence.estimate import explained_beside_each
 from magtensor.loop.evidence.grams import Whitened, grams_of_each
 from magtensor.loop.evidence.residual import Residual
 
@@ -18,16 +18,15 @@ class Scorer:
 
     def __init__(self, residual: Residual, adopted: Terms | None, colours: Colours) -> None:
         self.white = Whitened.of(residual, colours.across, colours.along, adopted, over_time=False)
-        self.own = 0.0 if adopted is None else explained(estimated_in(self.white, None))
+        self.known = None if adopted is None else estimated_in(self.white, None)
 
     def __call__(self, terms: Terms) -> float:
         return self.of_each([terms])[0]
 
     def of_each(self, several: Sequence[Terms], made: Made | None = None) -> list[float]:
         """The same of several sets of terms that differ in their series only, and of what is made of them."""
-        found, ranks = explained_by_each(grams_of_each(self.white, several, made))
-        most = several[0].count
-        return [rarity(e - self.own, max(min(r, most), 1)) for e, r in zip(found, ranks, strict=True)]
+        found, ranks = explained_beside_each(grams_of_each(self.white, several, made), self.known)
+        return [rarity(e, max(rank, 1)) for e, rank in zip(found, ranks, strict=True)]
 
 
 def rarity(explained: float, rank: int) -> float:

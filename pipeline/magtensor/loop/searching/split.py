@@ -35,6 +35,7 @@ from magtensor.loop.searching.profiling import (
     thinned,
 )
 from magtensor.loop.searching.screening import HOPELESS
+from magtensor.sharing import shared_out
 
 _SWEEPS = 2  # over both settings
 
@@ -46,8 +47,14 @@ def split(state: State, fixed: int, alpha: float, models: int) -> list[Candidate
     ----------
     alpha, models: as of the candidates that they stand beside.
     """
-    found = (_as_two(state, place, alpha, models) for place in range(fixed, len(state.adopted)))
-    return [candidate for candidate in found if candidate is not None]
+    places = range(fixed, len(state.adopted))
+    promising = shared_out(lambda place: _promising(state, place, models), places)
+    pairs = [(place, *pair) for place, found in zip(places, promising, strict=True) for pair in found]
+    found = shared_out(lambda pair: _assessed(state, *pair, alpha), pairs)
+    of_each: dict[int, list[Candidate]] = {}
+    for (place, *_), candidate in zip(pairs, found, strict=True):
+        of_each.setdefault(place, []).append(candidate.among(models))
+    return [max(several, key=lambda c: c.assessment.gain.total) for several in of_each.values()]
 
 
 def coefficients(state: State, candidate: Candidate) -> list[Array]:
@@ -64,29 +71,30 @@ def coefficients(state: State, candidate: Candidate) -> list[Array]:
     return [*start[:place], one, *start[place:], other]
 
 
-def _as_two(state: State, place: int, alpha: float, models: int) -> Candidate | None:
-    """One adopted response as two; None where it has no single setting of the kind, or chance explains as much."""
+def _promising(state: State, place: int, models: int) -> list[tuple[str, tuple[float, float], int]]:
+    """The setting of an adopted response, values of it for two in its place, of so many pairs; the best pair in white
+    noise and in noise of the residual's own colour, if they differ. None where it has no single setting of the kind, or
+    chance explains as much."""
     model = state.adopted[place]
     names = [name for name, grid in profiled(model.component).items() if of_ratios(grid)]
     if len(names) != 1 or model.terms(state.excitation).delay is not None:
-        return None
+        return []
     name = names[0]
     others = [other for i, other in enumerate(state.adopted) if i != place]
     settings = {value: _with(model, name, value) for value in profiled(model.component)[name].values(state.excitation)}
     values = sorted(v for v, one in settings.items() if not already(others, model.component, one.settings))
     pairs = [(a, b) for i, a in enumerate(values) for b in values[i + 1 :] if b > LEAST_RATIO * a]
     if not pairs:
-        return None
+        return []
     few, (back, given) = Thinned.of(state, SCREENING_SAMPLES), thinned(put_back_one(state, place), SCREENING_SAMPLES)
     terms = {value: few.of_model(settings[value]) for value in values}
     both = [joined([terms[a], terms[b]]) for a, b in pairs]
-    starts: dict[tuple[float, float], None] = {}
+    found: dict[tuple[float, float], None] = {}
     for beside, colours in ((few.white, WHITE), (few.coloured, colours_of(few.residual))):
         best = int(np.argmax(Scorer(back, given, colours).of_each(both)))
         if np.exp(-beside(both[best])) * len(pairs) * models < HOPELESS:
-            starts[pairs[best]] = None
-    found = [_assessed(state, place, name, pair, alpha, len(pairs)).among(models) for pair in starts]
-    return max(found, key=lambda c: c.assessment.gain.total, default=None)
+            found[pairs[best]] = None
+    return [(name, pair, len(pairs)) for pair in found]
 
 
 def _with(model: Adopted, name: str, value: float) -> Adopted:
@@ -96,7 +104,7 @@ def _with(model: Adopted, name: str, value: float) -> Adopted:
     return replace(model, settings={**model.settings, **at_rest, name: value})
 
 
-def _assessed(state: State, place: int, name: str, pair: tuple[float, float], alpha: float, tried: float) -> Candidate:
+def _assessed(state: State, place: int, name: str, pair: tuple[float, float], tried: int, alpha: float) -> Candidate:
     """The two, their settings refined, and what they explain beside what is adopted."""
     model = state.adopted[place]
     grid = sorted(profiled(model.component)[name].values(state.excitation))
