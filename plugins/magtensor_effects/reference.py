@@ -21,6 +21,7 @@ LEAST_FREEDOM = 3.0  # of a steady variation none is left, and a drift of the ba
 NEARBY_S = 2.0  # shorter delays show as the slope over this time
 LONGEST_S = 7200.0  # two time zones
 BETWEEN_NOISE_AND_DELAY = 0.75  # of the lag: half of it is what noise makes, all of it a delay
+AS_RESTLESS = 0.5  # times the size of the recorded variation, at least, that of the readings which would be right
 
 
 def _more_than_noise(x: Excitation, _: Mapping[str, Any], coefficients: Array, explained: float) -> bool:
@@ -76,13 +77,21 @@ def reference_scale(x: Excitation) -> Terms:
     return x.on_reference(0.01 * (f - f.mean()), "%", "excess")
 
 
-def _delayed_by_its_lag(_: Excitation, settings: Mapping[str, Any], coefficients: Array, __: float) -> bool:
-    """Whether the delay is the lag that the difference was taken over.
+def _delayed_by_its_lag(x: Excitation, settings: Mapping[str, Any], coefficients: Array, _: float) -> bool:
+    """Whether the delay is the lag that the difference was taken over, and the readings that would be right vary too.
 
-    Noise of the base station, slow or fast, seems to be explained by half of that difference, for it is in both.
+    Noise of the base station, slow or fast, seems to be explained by half of that difference, for it is in both. What
+    disturbs the station for a while is in one of the two: readings of a quiet time in its place take all of it off, as
+    leaving them out would, and tell nothing of a clock.
     """
     lag = float(settings["lag_s"])
-    return abs(lag) < NEARBY_S or coefficients[0] / lag > BETWEEN_NOISE_AND_DELAY
+    if abs(lag) < NEARBY_S:
+        return True
+    read = (x.time + lag >= x.readings.time[0]) & (x.time + lag <= x.readings.time[-1])
+    if not read.any() or coefficients[0] / lag <= BETWEEN_NOISE_AND_DELAY:
+        return False
+    recorded, right = x.readings.at(x.time[read]), x.readings.at(x.time[read] + lag)
+    return bool(np.std(right) >= AS_RESTLESS * np.std(recorded))
 
 
 def _about_its_delay(settings: Mapping[str, Any], coefficients: Array) -> dict[str, Any]:

@@ -1,4 +1,5 @@
-"""Slow noise of a base station is no scale factor of the variation, however alike the two happen to be."""
+"""Noise of a base station is neither a scale factor of the variation, however alike the two happen to be, nor a clock
+that is wrong."""
 
 from __future__ import annotations
 
@@ -49,3 +50,18 @@ def test_a_scale_factor_is_believed(power: float, excess: float) -> None:
     rng = np.random.default_rng(6)
     courses = [red(rng, power) for _ in range(SURVEYS)]
     assert sum(believed(v, excess * (v + 0.2 * red(rng, 1.0))) for v in courses) >= 0.9 * SURVEYS
+
+
+@pytest.mark.parametrize("lag_s", [-100.0, 100.0, -7.0])
+def test_readings_of_a_quiet_time_in_the_place_of_disturbed_ones_are_no_clock(lag_s: float) -> None:
+    """A car stands beside the station for a while; or the field itself goes on as it does, its stamps wrong."""
+    at = np.arange(-300.0, 900.0, 5.0)
+    slow = 5.0 * np.sin(at / 60.0) + np.sin(at / 17.0)
+    test = Registry.load().find("error_model", "reference_clock").agrees
+    assert test is not None
+    beside = 100.0 * ((at > 595.0 + lag_s if lag_s < 0.0 else at < 5.0 + lag_s) & (at > 0.0) & (at < 600.0))
+    for values, clock in ((slow, True), (0.1 * slow + beside, abs(lag_s) < 10.0)):
+        readings = SimpleNamespace(time=at, at=lambda t, values=values: np.interp(t, at, values))
+        x: Any = SimpleNamespace(time=np.arange(0.0, 600.0), readings=readings)
+        assert test(x, {"lag_s": lag_s}, np.array([0.95 * lag_s]), 0.9) is clock
+        assert not test(x, {"lag_s": lag_s}, np.array([0.5 * lag_s]), 0.9)

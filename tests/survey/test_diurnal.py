@@ -228,6 +228,16 @@ def test_a_spike_near_larger_ones_is_one(seed: int) -> None:
     assert np.flatnonzero(spikes(values, 8.0)).tolist() == places.tolist()
 
 
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_spikes_that_are_many_do_not_hide_each_other(seed: int) -> None:
+    """One reading in fifteen, two of them with one between: each makes the four beside it stray as well."""
+    rng = np.random.default_rng(seed)
+    places = np.concatenate([np.arange(7, 127, 15), [69]])
+    values = 49_000.0 + 0.1 * rng.standard_normal(134) + np.sin(np.arange(134) / 20.0)
+    values[places] += rng.choice([-1.0, 1.0], len(places)) * rng.uniform(20.0, 400.0, len(places))
+    assert np.flatnonzero(spikes(values, 8.0)).tolist() == sorted(places)
+
+
 def test_a_storm_with_a_gap_is_followed_to_both_sides_of_it() -> None:
     """The field went on during the gap: its far side is no neighbour of its near one, by which good readings would be
     spikes, or steps; a spike near it is one."""
