@@ -15,6 +15,7 @@ from magtensor.loop.fitting.trial import Trial, on_the_folds_of, trial
 from magtensor.loop.remainder.curve_of_a_channel import another_curve
 from magtensor.loop.remainder.tones import channels_of_the_line, tones
 from magtensor.loop.searching.any_law import by_a_curve, by_any_law, by_any_law_of
+from magtensor.loop.searching.beside_a_hole import of_a_hole
 from magtensor.loop.searching.contribution import eliminate, tones_of, without_models
 from magtensor.loop.searching.course_of_time import beside_time, responses_like, rivals_in_time
 from magtensor.loop.searching.exchange import exchanged, looked_at_again
@@ -92,6 +93,7 @@ class Rounds:
     Attributes:
         models, most_effects, alpha, lines, say: as in `search`; fixed: how many models were declared.
         failed: model -> why its regressors could not be made.
+        whole: the fit with the samples that were taken out because nothing explains them; None where none were.
     """
 
     models: Sequence[Component]
@@ -101,6 +103,7 @@ class Rounds:
     lines: Sequence[float] | None
     say: Callable[[str], None] | None
     failed: dict[str, str] = field(default_factory=dict)
+    whole: State | None = None
 
     def candidates(self, state: State, record: Record, how: Fitting) -> list[Candidate]:
         """What may be adopted beside what is."""
@@ -307,8 +310,11 @@ class Rounds:
         return replace(tried, after=trial(record, last, how)), dropped
 
     def of_another(self, chosen: Candidate, state: State) -> str:
-        """Why a candidate, before it is fitted, is taken for a part of what another model explains; "" if it is not."""
+        """Why a candidate, before it is fitted, is taken for a part of what another model explains, or nothing does; ""
+        if it is not."""
         if why := rate_instead(chosen, state, self.models):
+            return why
+        if self.whole is not None and (why := of_a_hole(chosen, state, self.whole, len(self.models))):
             return why
         return part_of_a_larger_law(chosen, state) or part_of_a_gradient(chosen, state)
 

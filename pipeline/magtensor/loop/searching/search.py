@@ -142,7 +142,7 @@ def _without_what_is_wrong(ended: Ended, rounds: Rounds) -> Ended:
     wrong = lasting(among_their_like(~np.asarray(ended.settled.fit.keep)), longest=ABOUT)
     if np.count_nonzero(wrong & ended.state.fit.keep) <= ABOUT:
         return ended
-    again = rounds.run(ended.record, ended.settled, replace(ended.how, searching=False))
+    again = replace(rounds, whole=ended.state).run(ended.record, ended.settled, replace(ended.how, searching=False))
     return replace(again, steps=(*ended.steps, *again.steps)) if again.adopts else ended
 
 
