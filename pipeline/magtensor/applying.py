@@ -332,8 +332,9 @@ def verification(calibrated: Survey, path: Path | Held, planned: Plan) -> dict[s
     `total_field_as_read` names errors of the base station that were left in (`_better_as_read`), `contradicted`
     effects without which |b| would be nearer to the survey's total field, `extrapolated` those that the survey
     takes beyond what the calibration has seen, `not_on_this_survey` those that its lengths refute, which were left
-    in, `strangers` and `turned_since` sensors that do not see what the others see, and `left_by_any_calibration_nT` is
-    what of |b| - F no other calibration of the sensors would take off.
+    in, `strangers` and `turned_since` sensors that do not see what the others see, `left_by_any_calibration_nT` is
+    what of |b| - F no other calibration of the sensors would take off, and `share_not_in_use` the part of its samples,
+    of all sensors, that are in no figure.
     """
     corrected = apply_to(calibrated, path, planned, uniform=True)
     after = survey_block(corrected)
@@ -341,7 +342,8 @@ def verification(calibrated: Survey, path: Path | Held, planned: Plan) -> dict[s
     if "declared/matrix" in calibrated and "calibration/effects" in calibrated:
         alone = apply_to(with_declared_alone(calibrated), path, planned, judge=False)
         before = survey_block(alone.merged({"good": corrected["good"]}))  # the same samples
-    found: dict[str, Any] = {"before": before, "after": after}
+    unused = 1.0 - float(corrected.good_by_sensor.mean())
+    found: dict[str, Any] = {"before": before, "after": after, "share_not_in_use": unused}
     if "total_field" in corrected:
         each = corrected.values("calibrated/b"), corrected.values("total_field"), corrected.good_by_sensor
         found["left_by_any_calibration_nT"] = left_by_any_calibration(*each)

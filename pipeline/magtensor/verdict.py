@@ -16,6 +16,7 @@ WORSE = 1.1  # times another error: clearly more
 OVERFITTED = 3.0  # the error on blocks that were not seen, over that of the fit
 LITTLE = 0.25  # of the variance beyond that of held-out blocks
 DISAGREES = 3.0  # times the error on held-out blocks
+UNUSED = 0.02  # of the samples: more than a few spikes
 
 
 def verdict(survey: Survey, verify: dict[str, Any] | None = None) -> dict[str, Any]:
@@ -119,7 +120,7 @@ def sentence(outcome: dict[str, Any]) -> str:
     doubt = outcome.get("calibration", {}).get("description", "")
     late = outcome.get("attitude", {}).get("description", "")
     doubts = "".join(f"; {words}" for words in (late, doubt) if words)
-    return f"{head}: {told}{tail}{_disagreement(outcome)}{doubts}."
+    return f"{head}: {told}{tail}{_disagreement(outcome)}{_not_in_use(outcome)}{doubts}."
 
 
 def _figures(before: dict[str, Any] | None, after: dict[str, Any]) -> str:
@@ -209,6 +210,14 @@ def _disagreement(outcome: dict[str, Any]) -> str:
             f"off: noise or disturbances of its own{too}"
         )
     return words
+
+
+def _not_in_use(outcome: dict[str, Any]) -> str:
+    """Words where the figures of a verification survey leave out a part of it that a reader would want to know of."""
+    share = (outcome["error"].get("verify") or {}).get("share_not_in_use") or 0.0
+    if share <= UNUSED:
+        return ""
+    return f"; {share:.0%} of the verification survey's samples are flagged and in none of its figures"
 
 
 def _beyond(verify: dict[str, Any]) -> str:

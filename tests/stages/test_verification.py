@@ -224,6 +224,23 @@ def test_a_survey_that_disagrees_says_whether_a_calibration_is_why(
     assert told in sentence(found)
 
 
+def test_samples_that_are_in_no_figure_are_said_to_be(surveys: Path, tmp_path: Path) -> None:
+    """One row in ten has a kick of 500 nT on one sensor of four, and no figure shows it."""
+    other = tmp_path / "other.h5"
+    shutil.copy(surveys / "verify.h5", other)
+    with h5py.File(other, "a") as file:
+        raw = file["b_raw"][:]
+        raw[::10, 0] += 500.0
+        file["b_raw"][:] = raw
+    kicked, alone = (
+        close_loop(surveys / "survey.h5", search=[], verify=v).verdict for v in (other, surveys / "verify.h5")
+    )
+    for found, least in ((kicked, 0.1), (alone, 0.0)):
+        share = found["error"]["verify"]["share_not_in_use"]
+        assert least - 0.002 <= share <= least + 0.01
+        assert (" of the verification survey's samples are flagged" in sentence(found)) is (least > 0)
+
+
 @pytest.mark.parametrize(
     ("names", "told"),
     [
