@@ -175,6 +175,17 @@ def test_a_reference_without_its_noise() -> None:
     np.testing.assert_allclose(quieted(field, CLEARANCE), field, atol=0.05)
 
 
+@pytest.mark.parametrize("noise_nT", [0.0, 0.1, 0.3])
+def test_a_coarse_base_station_is_quieter_than_its_readings(noise_nT: float) -> None:
+    """Of 1 nT: most readings repeat the one before, and the scatter of their steps is nothing."""
+    rng = np.random.default_rng(5)
+    field = 50_000.0 + 6.0 * np.sin(np.arange(300) / 25.0) + 3.0 * np.sin(np.arange(300) / 11.0)
+    coarse = np.round(field + noise_nT * rng.standard_normal(300))
+    quiet = quieted(coarse, CLEARANCE, 1.0)
+    assert np.std(quiet - field) < 0.65 * np.std(coarse - field)
+    np.testing.assert_array_equal(quieted(field, CLEARANCE, 0.0), quieted(field, CLEARANCE))
+
+
 def with_line(seed: int, amplitude: float, frequency: float = 0.083) -> Record:
     samples = 2400
     rng = np.random.default_rng(100 + seed)

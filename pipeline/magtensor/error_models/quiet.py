@@ -12,7 +12,7 @@ BANDS = 20  # the quietest of so many parts of the spectrum bounds the white noi
 LEAST_IN_A_BAND = 20  # or the quietest is quiet by chance
 
 
-def quieted(values: Array, clearance: float) -> Array:
+def quieted(values: Array, clearance: float, step: float = 0.0) -> Array:
     """A series (N,), evenly sampled, without its white noise: the best linear estimate of what was logged.
 
     A straight trend is left; a series too short to tell noise from signal is only its mean.
@@ -20,6 +20,7 @@ def quieted(values: Array, clearance: float) -> Array:
     Parameters
     ----------
     clearance: frequencies with less than so many times the noise power are left out altogether.
+    step: of its resolution, whose rounding is noise as well: a coarse log of what is quiet repeats itself.
     """
     from scipy.fft import idct
 
@@ -28,7 +29,7 @@ def quieted(values: Array, clearance: float) -> Array:
         return np.full(n, values.mean())
     trend, coefficients = _spectrum(values)
     power = coefficients**2
-    noise = _white(values, power)
+    noise = _white(values, power, step)
     if noise <= 0:
         return values
     width = max(n // 100, 5)
@@ -53,8 +54,9 @@ def _spectrum(values: Array) -> tuple[Array, Array]:
     return trend, dct(values - trend, norm="ortho")
 
 
-def _white(values: Array, power: Array) -> float:
+def _white(values: Array, power: Array, step: float = 0.0) -> float:
     bands = int(np.clip(len(values) // LEAST_IN_A_BAND, 1, BANDS))
     lowest = min(float(band.mean()) for band in np.array_split(power, bands))
     second = np.diff(values, n=2)
-    return min(float(np.median(np.abs(second)) * MAD_TO_SIGMA) ** 2 / 6.0, lowest)
+    scatter = max(float(np.median(np.abs(second)) * MAD_TO_SIGMA) ** 2 / 6.0, step**2 / 12.0)
+    return min(scatter, lowest)

@@ -15,6 +15,7 @@ from magtensor.error_models.quiet import quieted
 from magtensor.error_models.station import Station
 from magtensor.loop.fitting.model import Record
 from magtensor.survey.model import Survey
+from magtensor.survey.recorded_numbers import resolution
 from magtensor.survey.reference import spikes
 from magtensor.units import CURRENT, TEMPERATURE, UNITS
 
@@ -159,7 +160,7 @@ def _station(survey: Survey) -> Station | None:
         at, values = at[good], values[good]
     at = at - float(made.get("latency_s", 0.0))
     how = made.get("interpolation")
-    return Station(at, quieted(values, CLEARANCE), how if how in COURSES else "linear")
+    return Station(at, quieted(values, CLEARANCE, resolution(values)), how if how in COURSES else "linear")
 
 
 def _where_read(use: NDArray[np.bool_], time: Array, station: Station | None) -> NDArray[np.bool_]:
