@@ -188,6 +188,11 @@ def _disagreement(outcome: dict[str, Any]) -> str:
     if worse:
         what = f", {contradicted} above all" if contradicted else ""
         return f"; what was added makes the verification survey worse{what}: it does not carry over{beyond}"
+    if contradicted and after["all"] < before["all"]:
+        return (
+            "; C and o help there, fitted beside what was added: |b| would be nearer to the verification survey's "
+            f"total field if {contradicted} were not taken off"
+        )
     if contradicted:
         return f"; |b| would be nearer to the verification survey's total field without {contradicted}"
     if not apart:

@@ -285,12 +285,15 @@ def _without_fill_values(survey: Survey, notes: list[str]) -> Survey:
 
     filled: dict[str, Any] = {}
     for name, values in channels_of(survey)[0].items():
-        found = checks.fill_value(values)
-        if found is not None:
-            count = int((values == found).sum())
+        left = np.where(np.isinf(values), np.nan, values)
+        if infinite := int(np.isinf(values).sum()):
+            notes.append(f"{name}: {infinite} infinite values are taken for missing ones")
+        while (found := checks.fill_value(left)) is not None:
+            count = int((left == found).sum())
             notes.append(f"{name}: {count} values of {found:.6g}, far from all others, are taken for missing ones")
-            variable = survey[name]
-            filled[name] = (tuple(variable.dims), np.where(values == found, np.nan, values), variable.attrs)
+            left = np.where(left == found, np.nan, left)
+        if not np.array_equal(left, values, equal_nan=True):
+            filled[name] = (tuple(survey[name].dims), left, survey[name].attrs)
     return survey.merged(filled) if filled else survey
 
 

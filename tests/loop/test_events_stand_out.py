@@ -10,6 +10,7 @@ import pytest
 from loop_cases import Array, linear_state, synthetic
 from scipy.signal import lfilter
 
+from magtensor.error_models.station import Station
 from magtensor.loop.fitting.model import Record
 from magtensor.loop.searching.gates import ALPHA, Candidate
 from magtensor.loop.searching.outcome import why
@@ -72,6 +73,22 @@ def test_a_step_of_the_base_station_stands_out_of_that_wandering(step_nT: float)
     found = {c.model.name: c for c in candidates(beside_a_base_station_with(step + wandering(3, 300.0, 0.1), 3))}
     assert found["reference_step"].passes
     assert found["reference_step"].model.settings["time_s"] == pytest.approx(1800.5, abs=5.0)
+
+
+def test_a_step_of_the_base_station_is_found_between_any_two_of_its_readings() -> None:
+    """Which are 30 s apart, where the times tried are 49 s apart: next to the right two it explains hardly anything, so
+    that no way leads there."""
+    read = np.arange(-60.0, SAMPLES + 60.0, 30.0)
+    record = beside_a_base_station_with(np.zeros(SAMPLES), 5)
+    model = Registry.load().find("error_model", "reference_step")
+    for moment in [*np.arange(411.0, 1100.0, 67.0), 1014.0]:
+        known = np.interp(read, record.time, np.asarray(record.total_field))
+        station = Station(read, known + (read >= moment), "pchip")
+        field = station.at(record.time)
+        state = linear_state(replace(record, total_field=field, quiet_field=field, station=station))
+        [found] = candidates_of(state, [model], {}, ALPHA)
+        last = 30.0 * np.ceil(moment / 30.0)
+        assert found.passes and last - 30.0 < found.model.settings["time_s"] <= last, moment
 
 
 def test_two_steps_stand_out_one_after_the_other() -> None:

@@ -193,6 +193,17 @@ def test_an_effect_beyond_what_is_known_of_it_may_be_why_another_survey_disagree
     assert said in sentence(outcome)
 
 
+@pytest.mark.parametrize(
+    ("there", "said"),
+    [((1.0, 0.9), "C and o help there, fitted beside what"), ((1.0, 1.05), "nearer to the verification survey's")],
+)
+def test_what_is_better_not_taken_off_is_no_contradiction_of_the_figures(there: tuple[float, float], said: str) -> None:
+    outcome = of_errors((1.0, 0.2), there)
+    outcome["error"]["verify"]["contradicted"] = "current_field"
+    assert said in sentence(outcome)
+    assert ("were not taken off" in sentence(outcome)) is (there[1] < there[0])
+
+
 @pytest.mark.parametrize(("wandering_nT", "told_of"), [(0.0, True), (2.0, False)])
 def test_a_line_is_told_where_it_is_much_of_what_is_left(wandering_nT: float, told_of: bool) -> None:
     time = np.arange(SAMPLES)

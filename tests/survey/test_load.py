@@ -336,3 +336,20 @@ def test_readings_of_a_channel_that_cannot_be(load_variables: Load, variables: V
     np.testing.assert_array_equal(survey.values("temperature"), np.where(values == 85.0, np.nan, WARM))
     said = "temperature: 5 values (85), alone and far from all others, are taken for missing"
     assert survey.attributes["notes"] == [said]
+
+
+def test_several_numbers_that_stand_for_missing_readings(load_variables: Load, variables: Variables) -> None:
+    """The one of them is no near value of the other; and an infinite one is none either."""
+    values = WARM.copy()
+    places = {-999.0: slice(10, 50), 1e20: slice(60, 63), np.inf: slice(100, 130)}
+    for number, place in places.items():
+        values[place] = number
+    survey = load_variables({**variables, "temperature": (["time"], values, {"units": "degC"})})
+    missing = np.isin(values, list(places))
+    np.testing.assert_array_equal(survey.values("temperature"), np.where(missing, np.nan, WARM))
+    said = [
+        "30 infinite values are",
+        "3 values of 1e+20, far from all others, are",
+        "40 values of -999, far from all others, are",
+    ]
+    assert survey.attributes["notes"] == [f"temperature: {each} taken for missing ones" for each in said]

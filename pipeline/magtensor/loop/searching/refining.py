@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from magtensor.calibration.types import Array
 from magtensor.components import Component
 from magtensor.error_models.excitation import Excitation
 from magtensor.error_models.settings import Cleaned, EventTimes, Frequencies, Range, profiled
@@ -60,7 +61,8 @@ def refined(model: Component, settings: dict[str, Any], state: State, failed: di
             best = max([best, *finer], key=gain)
             low, high = best - (finer[1] - finer[0]), best + (finer[1] - finer[0])
         if isinstance(grid, EventTimes):
-            best = _its_time(gain, Scorer(residual, given, WHITE), at, (low, high), best, state.excitation)
+            between = _between_samples(model, state.excitation)
+            best = _its_time(gain, Scorer(residual, given, WHITE), at, (low, high), best, between)
         else:
             best = golden(gain, low, high, best, _OF_A_LINE if isinstance(grid, Frequencies) else REFINEMENTS)
         if low <= 0.0 <= high and of_ratios(grid) and gain(best) - gain(0.0) < SEPARATION / 2.0:
@@ -101,9 +103,9 @@ def _its_time(
     at: Callable[[float], Terms | None],
     limits: tuple[float, float],
     best: float,
-    x: Excitation,
+    between: Array,
 ) -> float:
-    """The time of an event between limits, s, to a sample.
+    """The time of an event between limits, s, to a sample, `between` any two of which (M,) it may have been.
 
     In white noise the way to it rises from afar. In noise of the colour that a large jump leaves only the very sample
     explains anything: there it is sought among the samples about the time found in white noise, which may be in a pause
@@ -115,13 +117,23 @@ def _its_time(
         found = at(value)
         return -np.inf if found is None else white(found)
 
-    steps = int(np.clip(np.ceil(np.log(max((high - low) / x.spacing, 2.0)) / _GOLDEN), REFINEMENTS, _OF_A_LINE))
+    spacing = float(np.median(np.diff(between))) if len(between) > 1 else high - low
+    steps = int(np.clip(np.ceil(np.log(max((high - low) / spacing, 2.0)) / _GOLDEN), REFINEMENTS, _OF_A_LINE))
     about = golden(in_white, low, high, best, steps)
-    between = (x.elapsed[1:] + x.elapsed[:-1]) / 2.0
     after = int(np.searchsorted(between, about))
     near = between[max(after - _SAMPLES_ABOUT, 0) : after + _SAMPLES_ABOUT]
     from_afar = golden(gain, low, high, best)
     return max((float(v) for v in (best, from_afar, *near)), key=gain)
+
+
+def _between_samples(model: Component, x: Excitation) -> Array:
+    """(M,) s after the start: the middle between any two samples, or, of what happens to the base station and shows
+    from a reading on, between any two of its readings during the survey."""
+    at = x.elapsed
+    if model.effect == "reference":
+        at = x.readings.time - x.start
+        at = at[max(np.searchsorted(at, 0.0) - 1, 0) : np.searchsorted(at, x.duration) + 1]
+    return np.asarray((at[1:] + at[:-1]) / 2.0)
 
 
 def _around(grid: Range | EventTimes | Frequencies, value: float, x: Excitation) -> tuple[float, float]:
