@@ -29,7 +29,7 @@ from magtensor.loop.fitting.model import Adopted, Fitting, Record, State
 from magtensor.loop.fitting.refit import joint_state
 from magtensor.loop.fitting.separation import fold_gain, separated
 from magtensor.loop.fitting.trial import Trial, on_the_folds_of, trial
-from magtensor.loop.remainder.curve_of_a_channel import PIECES, followed
+from magtensor.loop.remainder.curve_of_a_channel import PIECES, another_curve, followed
 from magtensor.loop.searching.adopting import polished
 from magtensor.loop.searching.contribution import eliminate, put_back_some
 from magtensor.loop.searching.found import Step
@@ -132,6 +132,13 @@ def by_any_law_of(channel: str, state: State, models: Sequence[Component], alpha
         curves = [_by_a_curve(state, Adopted(component, plain | way), [], channels, alpha, len(models)) for way in ways]
         found += [max((c for c in curves if c), key=lambda c: c.assessment.gain.total)] if any(curves) else []
     return found
+
+
+def outdone_by(chosen: Candidate, state: State) -> str:
+    """The channel any curve of which explains more than a candidate that follows another; "" where there is none."""
+    theta = chosen.assessment.theta[-chosen.terms.count :]
+    seen = chosen.before or state  # at the samples of its terms
+    return another_curve(seen, chosen.model, chosen.terms, theta, chosen.assessment.colours)
 
 
 def by_a_curve(model: Adopted) -> bool:

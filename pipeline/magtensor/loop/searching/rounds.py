@@ -12,9 +12,8 @@ from magtensor.error_models.needs import missing
 from magtensor.loop.fitting.model import CHANNEL, Fitting, Record, State
 from magtensor.loop.fitting.refit import settled
 from magtensor.loop.fitting.trial import Trial, on_the_folds_of, trial
-from magtensor.loop.remainder.curve_of_a_channel import another_curve
 from magtensor.loop.remainder.tones import channels_of_the_line, tones
-from magtensor.loop.searching.any_law import by_a_curve, by_any_law, by_any_law_of
+from magtensor.loop.searching.any_law import by_a_curve, by_any_law, by_any_law_of, outdone_by
 from magtensor.loop.searching.beside_a_hole import of_a_hole
 from magtensor.loop.searching.contribution import eliminate, tones_of, without_models
 from magtensor.loop.searching.course_of_time import beside_time, responses_like, rivals_in_time
@@ -37,6 +36,7 @@ from magtensor.loop.searching.likeness import followed_by_a_curve, part_of_the_s
 from magtensor.loop.searching.on_fewer_sensors import on_those_needed
 from magtensor.loop.searching.on_more_sensors import in_the_place_of_others, on_more_sensors
 from magtensor.loop.searching.own_fit import at_their_own_fit
+from magtensor.loop.searching.part_of_a_waveform import part_of_a_waveform
 from magtensor.loop.searching.profiling import repeatable
 from magtensor.loop.searching.rivals import (
     as_predictive,
@@ -238,7 +238,7 @@ class Rounds:
                 refuse(chosen.model.name, AS_LASTING.format(lasting.model.name))
                 left[:] = [lasting if c.model.name == lasting.model.name else c for c in left]
                 continue
-            if why := self.of_another(chosen, before.state):
+            if why := self.of_another(chosen, before.state) or part_of_a_waveform(chosen, before.state, record):
                 refuse(chosen.model.name, why)
                 continue
             switched = switched_with(chosen.model, before.state)
@@ -257,7 +257,7 @@ class Rounds:
                 refuse(chosen.model.name, time.refused)
                 courses.append(chosen)
                 continue
-            if channel := _outdone(chosen, before.state):
+            if channel := outdone_by(chosen, before.state):
                 outdone.append(chosen)
                 refuse(chosen.model.name, f"any curve of {channel} explains more")
                 ask([channel])
@@ -401,13 +401,6 @@ class Rounds:
             record, state = renewed(record, last, how)
         gone = (*([instead] if instead else []), *(() if NAME in dropped else dropped))
         return None, (record, state, replace(step, adopted=source.evidence, dropped=gone, like=source.like))
-
-
-def _outdone(chosen: Candidate, state: State) -> str:
-    """The channel any curve of which explains more than a candidate that follows another; "" where there is none."""
-    theta = chosen.assessment.theta[-chosen.terms.count :]
-    seen = chosen.before or state  # at the samples of its terms
-    return another_curve(seen, chosen.model, chosen.terms, theta, chosen.assessment.colours)
 
 
 @dataclass(frozen=True)
