@@ -33,7 +33,7 @@ MIRROR = (
     "(reference/world_field) would tell"
 )
 GAUGE = "one rotation"  # how the words begin that name the common rotation as unobservable
-_OF_A_FRAME = ("units", "frame", "unobservable", "diagnostics", "long_name", "common_rotation")
+_OF_A_FRAME = ("units", "frame", "unobservable", "diagnostics", "long_name", "common_rotation", "attitude_refuted")
 SIGNIFICANT = 0.01  # chance that a rotation which is none passes for one
 
 

@@ -49,10 +49,14 @@ def verdict(survey: Survey, verify: dict[str, Any] | None = None) -> dict[str, A
         found |= loop
     if verify is not None:
         found["error"]["verify"] = verify
-    if "calibration/common_rotation" in survey:
-        late = survey["calibration/common_rotation"].attrs.get("attitude_delay")
-        found |= {"attitude": {"description": str(late)}} if late else {}
-    return found
+    told = [
+        str(survey[name].attrs[attribute])
+        for name, attribute in (
+            ("calibration/common_rotation", "attitude_delay"), ("calibration/matrix", "attitude_refuted")
+        )
+        if name in survey and survey[name].attrs.get(attribute)
+    ]  # fmt: skip
+    return found | ({"attitude": {"description": "; ".join(told)}} if told else {})
 
 
 def survey_block(survey: Survey) -> dict[str, Any] | None:

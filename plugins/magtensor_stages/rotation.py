@@ -9,7 +9,7 @@ from pydantic import Field
 
 from magtensor import DataError, UsageError, stage
 from magtensor.calibrated import LEFT_FREE, restored
-from magtensor.errors import did_you_mean
+from magtensor.errors import NotEnoughData, did_you_mean
 from magtensor_stages.sensors import COMMON, naming, published_parameters
 
 if TYPE_CHECKING:
@@ -104,5 +104,7 @@ def fix_rotation(
             raise type(error)(error.what, where=error.where, hint=hint) from error
         matrix = survey["calibration/matrix"]
         attributes = dict(matrix.attrs) | {"common_rotation": f"{LEFT_FREE}{error.what}"}
+        if "attitude" in (error.where or "") and not isinstance(error, NotEnoughData):
+            attributes["attitude_refuted"] = "; ".join(p for p in (error.what, error.hint) if p)
         return {"calibration/matrix": (matrix.dims, matrix.values, attributes)}
     return as_platform(survey, done) | published_parameters(done.calibration, survey.sensors)

@@ -267,3 +267,15 @@ def test_a_survey_that_cannot_verify_costs_no_result(
     assert told in error["verify"]["not_possible"]
     assert "NOT verified: the calibration is for the sensors S1, S2, S3, S4" in finished.sentence
     assert "verification survey" not in finished.sentence and (tmp_path / "out/calibration.nc").exists()
+
+
+def test_an_attitude_that_is_misread_is_in_the_verdict(tmp_path: Path) -> None:
+    """The loop goes on without it, and the verdict alone would not say why there is no frame of the platform."""
+    path = tmp_path / "inverse.h5"
+    write(simulate(SCENARIO | {"seed": 1, "logging": {"attitude": True}}), path)
+    with h5py.File(path, "a") as file:
+        file["attitude"][:] *= [-1.0, -1.0, -1.0, 1.0]
+    found = close_loop(path, search=[]).verdict
+    words = found["attitude"]["description"]
+    assert "the attitude does not go with the field" in words and "`maps: world to platform`" in words
+    assert words in sentence(found)

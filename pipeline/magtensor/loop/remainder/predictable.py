@@ -118,7 +118,7 @@ def converter_words(state: State) -> list[str]:
     names = ", ".join(f"{sensor} ({' '.join(axes)})" for sensor, axes in found.items())
     return [
         f"what {names} add follows from what they read, by {max(amounts):.2g} nT rms at most, predicted on held-out "
-        "blocks: a converter that is not linear"
+        "blocks, as a converter that is not linear would make it"
     ]
 
 
