@@ -77,6 +77,25 @@ def test_a_law_that_is_no_power_is_found_and_nothing_beside_it(law: str) -> None
     assert last.residual.square() < 1.1
 
 
+@pytest.mark.long
+def test_two_laws_of_one_channel_are_one_curve() -> None:
+    """Of a part that turns through the second and the third harmonic of its angle, each along its own vectors: the
+    sensors share two waveforms, and neither goes as the angle or as a cosine or a sine of it."""
+    rng = np.random.default_rng(1)
+    angle = 2.0 * course(1, remembers_s=60.0)
+    second, third = (rng.uniform(-2.0, 2.0, (4, 3)) for _ in range(2))
+    added = np.multiply.outer(np.cos(2.0 * angle), second) + np.multiply.outer(np.sin(3.0 * angle), third)
+    channels = {"valve": angle, "rain": course(51)}
+    record = replace(
+        synthetic(1, SAMPLES, noise_nT=0.3, added=added),
+        logged=channels, units=dict.fromkeys(channels, "1"), origins=dict.fromkeys(channels, 0.0),
+    )  # fmt: skip
+    last = found(record).last
+    assert [(a.name, a.settings["channel"]) for a in last.adopted] == [("channel_response", "valve")]
+    assert last.adopted[0].settings["bends"]
+    assert last.residual.square() < 1.5  # 8.4 with nothing adopted
+
+
 @pytest.mark.parametrize("seed", [3, 4])
 def test_what_acts_on_one_sensor_where_a_channel_is_low(seed: int) -> None:
     """It is saturated most of the time, so that a line that explains where it acts predicts elsewhere what is not."""

@@ -141,7 +141,8 @@ def test_what_another_width_of_an_adopted_law_explains_is_no_other_effect(
     monkeypatch.setattr(rounds, "simplest", unchanged)
     monkeypatch.setattr(rounds, "nearest", unchanged)
     monkeypatch.setattr(rounds, "switched_with", lambda *_: ())
-    monkeypatch.setattr(rounds, "_outdone", lambda *_: "")
+    monkeypatch.setattr(rounds, "outdone_by", lambda *_: "")
+    monkeypatch.setattr(rounds, "part_of_a_waveform", lambda *_: "")
     monkeypatch.setattr(rounds, "rate_instead", lambda *_: "")
     monkeypatch.setattr(rounds, "hindered_by_another", lambda *_: None)
     monkeypatch.setattr(rounds, "as_predictive", lambda *_: set())
@@ -190,7 +191,8 @@ def test_of_one_name_the_curve_of_another_channel_is_still_tried(monkeypatch: py
         "as_predictive": lambda *_: set(),
         "by_a_worse_log": lambda *_: set(),
         "beside_time": lambda *_: BesideTime(True),
-        "_outdone": lambda chosen, _: "wind" if chosen is line else "",
+        "outdone_by": lambda chosen, _: "wind" if chosen is line else "",
+        "part_of_a_waveform": lambda *_: "",
         "by_any_law_of": curves,
     }.items():
         monkeypatch.setattr(rounds, name, does)

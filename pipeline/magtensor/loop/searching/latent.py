@@ -104,11 +104,6 @@ class Sought:
         """Whether it is there."""
         return self.p < ALPHA and not self.of_the_log
 
-    @property
-    def one_waveform(self) -> bool:
-        """Whether nothing stands against it but what it follows, or what may leave it."""
-        return not self.objection or bool(self.left_by) or self.objection.startswith(OF_A_CHANNEL)
-
 
 def sought(state: State, record: Record, *, may_follow: bool = False) -> Sought | None:
     """Look for a waveform that the sensors share; None where there are too few sensors or samples to ask.

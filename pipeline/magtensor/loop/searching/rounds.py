@@ -366,9 +366,9 @@ class Rounds:
         return Kept(both, chosen, then=(second.step(state, candidates),))
 
     def by_its_channel(self, record: Record, standing: Trial, shared: Sought | None, how: Fitting, models: int) -> Kept:
-        """What a waveform that the sensors share comes from, where a curve of a logged channel predicts it: then the
-        source is logged, and only its law had no name."""
-        if shared is None or not shared.significant or not shared.one_waveform:
+        """What a waveform that the sensors share comes from, alone or with another, where a curve of a logged channel
+        predicts it: then the source is logged, and only its law had no name."""
+        if shared is None or not shared.significant:
             return Kept(None)
         channel = followed_by_a_curve(shared.time, shared.values, record)
         state = standing.state
