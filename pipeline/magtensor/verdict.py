@@ -184,7 +184,9 @@ def _disagreement(outcome: dict[str, Any]) -> str:
     if not all(known):
         return ""
     worse, apart = after["all"] > WORSE * before["all"], after["all"] > DISAGREES * here["all"]
-    if (worse or apart) and any(a.get("kind") == "site" for a in outcome["adopted"]):
+    site = any(a.get("kind") == "site" for a in outcome["adopted"])
+    largest = max(_of_all(held_out.get("before") or {}, key), here["all"])  # what the site makes of the first survey
+    if (worse or apart) and site and after["all"] <= DISAGREES * largest:
         return (
             "; the field of the site was modelled, not taken off: if the verification survey was made there too, it is "
             "in it and in its errors"

@@ -204,6 +204,15 @@ def test_what_is_better_not_taken_off_is_no_contradiction_of_the_figures(there: 
     assert ("were not taken off" in sentence(outcome)) is (there[1] < there[0])
 
 
+@pytest.mark.parametrize(
+    ("after_nT", "said"), [(2.0, "the field of the site was modelled"), (20.0, "disagrees with the calibration")]
+)
+def test_a_field_of_the_site_is_no_reason_for_more_than_it_made(after_nT: float, said: str) -> None:
+    """It made 1 nT of the first survey; a verification survey of another instrument errs by far more."""
+    told = sentence(of_errors((1.0, 0.2), (after_nT, after_nT), kind="site"))
+    assert said in told and ("field of the site" in told) is (after_nT < 3.0)
+
+
 @pytest.mark.parametrize(("wandering_nT", "told_of"), [(0.0, True), (2.0, False)])
 def test_a_line_is_told_where_it_is_much_of_what_is_left(wandering_nT: float, told_of: bool) -> None:
     time = np.arange(SAMPLES)
