@@ -202,7 +202,7 @@ def _disagreement(outcome: dict[str, Any]) -> str:
     if contradicted:
         return f"; |b| would be nearer to the verification survey's total field without {contradicted}"
     if not apart:
-        return _carried_over(held_out, verify)
+        return _carried_over(held_out, verify) or _of_the_tensor(held_out, verify)
     each = {s: v for s, v in after.items() if s != "all" and v is not None and here.get(s)}
     sensors = [s for s, v in each.items() if v > DISAGREES * here[s]]
     where = f" of {', '.join(sensors)}" if 0 < len(sensors) < len(each) else ""
@@ -234,6 +234,18 @@ def _not_in_use(outcome: dict[str, Any]) -> str:
 def _beyond(verify: dict[str, Any]) -> str:
     """Which effects a verification survey takes beyond what the calibration has seen."""
     return f" ({beyond})" if (beyond := verify.get("extrapolated")) else ""
+
+
+def _of_the_tensor(held_out: dict[str, Any], verify: dict[str, Any]) -> str:
+    """Words where |b| of a verification survey is as it was on held-out blocks and the tensor is not: a sensor that
+    repeats a vector, or one that was turned, has the right length."""
+    here, there = (_of_all(b.get("after") or {}, "tensor_rms_nT_per_m") for b in (held_out, verify))
+    if not 0.0 < DISAGREES * here < there:
+        return ""
+    return (
+        f"; the verification survey's tensor errs by {round(there / here)} times as much as on held-out blocks, its "
+        "|b| does not: a gradient of that place, or a sensor that gives another vector of the same length for a while"
+    )
 
 
 def _carried_over(held_out: dict[str, Any], verify: dict[str, Any]) -> str:

@@ -213,6 +213,14 @@ def test_a_field_of_the_site_is_no_reason_for_more_than_it_made(after_nT: float,
     assert said in told and ("field of the site" in told) is (after_nT < 3.0)
 
 
+@pytest.mark.parametrize(("tensor", "said"), [(0.6, False), (150.0, True)])
+def test_a_tensor_that_errs_where_the_length_does_not_is_told(tensor: float, said: bool) -> None:
+    outcome = of_errors((1.0, 0.2), (1.0, 0.2))
+    for name, value in (("held_out", 0.5), ("verify", tensor)):
+        outcome["error"][name]["after"]["tensor_rms_nT_per_m"] = {"all": value}
+    assert ("300 times as much as on held-out blocks" in sentence(outcome)) is said
+
+
 @pytest.mark.parametrize(("wandering_nT", "told_of"), [(0.0, True), (2.0, False)])
 def test_a_line_is_told_where_it_is_much_of_what_is_left(wandering_nT: float, told_of: bool) -> None:
     time = np.arange(SAMPLES)
