@@ -13,6 +13,7 @@ from scipy.signal import lfilter
 from magtensor.loop.fitting.model import Adopted, Fitting, Record
 from magtensor.loop.fitting.refit import joint_state
 from magtensor.loop.searching.likeness import part_of_the_source
+from magtensor.loop.searching.outcome import described
 from magtensor.loop.searching.search import search
 from magtensor.registry import Registry
 from magtensor.tensor.geometry import standard_geometry
@@ -63,3 +64,21 @@ def test_an_event_of_its_own_stays(seed: int) -> None:
     assert {a.name for a in found.last.adopted} == {"offset_while", "latent_source"}
     event = next(a for a in found.last.adopted if a.name == "offset_while")
     assert sorted(event.settings.values()) == pytest.approx([BEGIN, END], abs=3.0)
+
+
+@pytest.mark.long
+def test_a_step_of_what_a_channel_does_from_then_on_is_a_part_of_that() -> None:
+    """A current that acts from midway on (a relay whose log is missing) has a mean: a jump takes that, and leaves what
+    moves the sensors as it did."""
+    rng = np.random.default_rng(12)
+    level = np.repeat(rng.uniform(2.0, 4.0, 60), N // 60)
+    acts = np.where(np.arange(N) < N // 2, 0.0, level)
+    record = synthetic(12, N, noise_nT=0.3, added=np.multiply.outer(acts, rng.uniform(-0.5, 0.5, (4, 3))))
+    warms = 1.0 / (1.0 + np.exp((N / 2 - np.arange(N)) / 60.0))  # goes with it by 0.7, and is not its cause
+    logged, units = {"current_motor": level, "temperature": warms}, {"current_motor": "A", "temperature": "degC"}
+    record = replace(record, logged=logged, units=units, origins=dict.fromkeys(logged, 0.0))
+    models = [Registry.load().find("error_model", name) for name in ("offset_step", "current_field", "latent_source")]
+    found = search(record, models, Fitting())
+    assert [a.name for a in found.last.adopted] == ["latent_source"]
+    [told] = described(found, found.record, 0)["adopted"]
+    assert told["means"].startswith("goes as current_motor from") and "most_like_channel" not in told

@@ -245,7 +245,7 @@ def source_instead(
     found: list[Source] = []
     for gone in ([places] if places else []) + one_each:
         less = without_models(record, state, gone, how)
-        tried = left.significant and all(generic(state.adopted[i]) for i in gone)
+        tried = left.significant and all(generic(state.adopted[i]) or happens_once(state.adopted[i]) for i in gone)
         shared = sought(less, record, may_follow=tried)
         source = None if shared is None else tried_source(component, record, less, shared, how, alpha)[1]
         if source is not None:

@@ -110,9 +110,10 @@ def _adopted(found: Search, record: Record, index: int) -> dict[str, Any]:
     found_of = dict(zip(zip(sensors, names, strict=True), map(float, state.theta[index]), strict=True))
     means = "" if meaning is None else meaning(_with_what_differs(found, record), model.settings, found_of)
     means = means or _as_another_begins(state, index)
-    if model.name == NAME and not (step is not None and step.like) and record.waveform is not None:
-        follows = followed_in_part(record.time, record.waveform, record)
-        means = means or (f"goes as {follows}, and rests else" if follows else "")
+    like = "" if step is None else step.like
+    hidden = model.name == NAME and record.waveform is not None
+    if hidden and (follows := followed_in_part(record.time, np.asarray(record.waveform), record)):
+        means, like = means or f"goes as {follows}, and rests else", ""
     return {
         "error_model": model.name,
         "kind": model.component.effect,
@@ -126,7 +127,7 @@ def _adopted(found: Search, record: Record, index: int) -> dict[str, Any]:
         "indistinguishable_from": rivals,
         **({"channels_as_good": list(step.channels)} if step is not None and step.channels else {}),
         **({"means": means} if means else {}),
-        **({"most_like_channel": step.like} if step is not None and step.like else {}),
+        **({"most_like_channel": like} if like else {}),
     }
 
 
