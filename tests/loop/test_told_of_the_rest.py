@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from loop_cases import Array, linear_state, looked_at, synthetic
+from loop_cases import BASE, Array, linear_state, looked_at, scenario, synthetic, verdict_of
 
 from magtensor.loop.fitting.model import Adopted, Fitting, Record
 from magtensor.loop.fitting.refit import joint_state, loud_stretches, rounding
@@ -371,3 +372,18 @@ def test_a_calibration_that_does_not_carry_over_is_told(unseen_nT: float, told: 
         "error": {"fit": fit, "held_out": {"before": unseen, "after": unseen}},
     }
     assert ("the survey is too short to determine it" in sentence(outcome)) is told
+
+
+@pytest.mark.parametrize("noise_deg", [0.1, pytest.param(1.0, marks=pytest.mark.long)])
+def test_what_an_attitude_s_error_leaves_of_a_gradient_is_noted_and_not_unexplained(
+    noise_deg: float, tmp_path: Path
+) -> None:
+    """Of 40 nT some 0.1 nT at a sensor, where a sample has 0.15 nT of noise on each axis; or more, as noise."""
+    survey = scenario(
+        5, {"type": "site_gradient", "tensor_nT_per_m": [300.0, 90.0, 0.0, -150.0, 30.0]},
+        motion=BASE["motion"] | {"duration_s": 600.0}, logging={"attitude": True, "attitude_noise_deg": noise_deg},
+    )  # fmt: skip
+    verdict = verdict_of(tmp_path, survey, models=["site_gradient", "latent_source"])
+    assert [a["error_model"] for a in verdict["adopted"]] == ["site_gradient"]
+    assert not verdict["unexplained"]["present"]
+    assert "less than 5 % of what is adopted, whose laws may leave it" in verdict["unexplained"]["description"]

@@ -64,6 +64,7 @@ IMPROPER = 1 / 3  # of the noise of a sensor's usual axis
 SINGLE_STRETCH = "it acts in a single short stretch, which no other can confirm"
 ONCE = 0.9  # of a waveform's power in a stretch as long as one that is held out
 OF_A_CHANNEL = "its waveform goes as"
+LEFT_BY_LAWS = "it is less than 5 % of what is adopted, whose laws may leave it"
 SECOND = 0.1  # a second factor this strong beside the first: not one waveform
 
 
@@ -143,7 +144,7 @@ def sought(state: State, record: Record, *, may_follow: bool = False) -> Sought 
     if not told:
         objection = "with two sensors it cannot be told from a disturbance of one of them"
     elif n * float(seen @ seen) <= OF_THE_LAW * explained_before(state, between=True):
-        objection = "it is less than 5 % of what is adopted, whose laws may leave it"
+        objection = LEFT_BY_LAWS
     elif (unseen := of_an_unseen_path(state)) and n * float(seen @ seen) <= explained_by(state, unseen):
         name = state.adopted[unseen[0]].name
         objection = f"it is less than {name} explains, which remembers the field on the way between the samples"

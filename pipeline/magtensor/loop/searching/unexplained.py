@@ -40,7 +40,7 @@ from magtensor.loop.remainder.sparse_readings import SparseReadings, sparse_read
 from magtensor.loop.remainder.tones import channels_of_the_line, of_the_turning
 from magtensor.loop.remainder.turned_too_far import turned_too_far_words
 from magtensor.loop.searching.found import Search
-from magtensor.loop.searching.latent import shared_words
+from magtensor.loop.searching.latent import LEFT_BY_LAWS, shared_words
 from magtensor.loop.searching.like_a_station import channels_of_the_total_field, turns_with_the_platform
 from magtensor.loop.searching.suspects import Suspects
 from magtensor.sharing import shared_out
@@ -78,6 +78,8 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
     elif band is not None:
         excess = max(excess**2 + state.residual.scale**2 - band.rms_nT**2, 0.0) ** 0.5
     beside = [*loud.words, *unread_words(state, record)]
+    if excess < state.residual.scale and words == _left_by_a_law(found, record):
+        words, beside = [], [*words, *beside]
     gradient = gradient_share(state, record.position)
     shaped = bool(words) and gradient > 0
     if shaped:
@@ -156,6 +158,16 @@ def _what_shows(found: Search, record: Record, excess: float, sparse: SparseRead
                 cause += f"; it follows {' and '.join(names)}"
         words.append(f"{slow:.3g} nT rms of |b| - F, {where}, is no white noise{cause}")
     return words
+
+
+def _left_by_a_law(found: Search, record: Record) -> list[str]:
+    """Words for a waveform that the laws of what is adopted may leave, an attitude's error in a gradient above all, and
+    that is less than the noise of a sample, and for what of the same the attitude predicts; none of another one."""
+    shared, noise = found.shared, found.told.residual.noise
+    if shared is None or shared.objection != LEFT_BY_LAWS:
+        return []
+    small = np.all(np.sum(shared.direction**2, axis=1) < np.sum(noise.reshape(-1, 3) ** 2, axis=1))
+    return [shared_words(shared, record.sensors), *attitude_words(found.told)] if small else []
 
 
 def _largest_of_the_total_field(state: State) -> tuple[str, float]:
