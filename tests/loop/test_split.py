@@ -9,12 +9,16 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
-from loop_cases import BASE, Array, adopted_names, scenario, verdict_of
+from loop_cases import BASE, Array, adopted_names, loaded, scenario, verdict_of
 from scipy.integrate import solve_ivp
 
-from magtensor.loop.fitting.model import Adopted
+from magtensor.loop.fitting.model import Adopted, Fitting
+from magtensor.loop.fitting.refit import joint_state
+from magtensor.loop.searching.gates import ALPHA
 from magtensor.loop.searching.profiling import already
+from magtensor.loop.searching.split import split
 from magtensor.registry import Registry
+from magtensor.sharing import PROCESSES
 
 THERMAL = ("temperature_offset", "temperature_rate", "offset_drift", "warm_up")
 WHITE_NT = 0.15
@@ -92,6 +96,22 @@ def test_a_drift_beside_one_time_constant_is_a_drift(seed: int, tmp_path: Path) 
     told = verdict_of(tmp_path, thermal(seed), warmed({120.0: 1.0}, rms_nT=4.0, drift_nT=6.0), THERMAL)
     assert [a["error_model"] for a in told["adopted"]].count("temperature_offset") == 1
     assert adopted_names(told) == {"temperature_offset", "offset_drift"}
+
+
+def test_several_processes_find_the_same_two(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    record = loaded(tmp_path, thermal(5), warmed({30.0: 0.5, 900.0: 0.5}, rms_nT=4.0))
+    component = Registry.load().find("error_model", "temperature_offset")
+    settings = {name: parameter.default for name, parameter in component.parameters.items()}
+    adopted = Adopted(component, settings | {"channel": "temperature", "lag_s": 200.0})
+    state = joint_state(record, [adopted], Fitting())
+    found = []
+    for processes in ("1", "2"):
+        monkeypatch.setenv(PROCESSES, processes)
+        [two] = split(state, 0, ALPHA, 4)
+        assert two.passes and two.moved is not None
+        found.append((two.moved[1].settings, two.model.settings, two.assessment.gain.total))
+    assert found[0] == found[1]
+    assert 15.0 < found[0][0]["lag_s"] < 60.0 and 500.0 < found[0][1]["lag_s"] < 1350.0
 
 
 def test_what_two_responses_began_with_makes_them_no_two() -> None:

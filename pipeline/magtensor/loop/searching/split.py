@@ -14,9 +14,9 @@ import numpy as np
 
 from magtensor.calibration.types import Array
 from magtensor.error_models.settings import profiled
-from magtensor.error_models.terms import joined
+from magtensor.error_models.terms import Terms, joined
 from magtensor.golden import golden
-from magtensor.loop.evidence.assessment import WHITE, assess, colours_of, estimated, likeliest
+from magtensor.loop.evidence.assessment import WHITE, Assessment, assess, colours_of, estimated, likeliest
 from magtensor.loop.evidence.grams import Whitened
 from magtensor.loop.evidence.scoring import Scorer
 from magtensor.loop.fitting.log_noise import brought_in
@@ -50,9 +50,15 @@ def split(state: State, fixed: int, alpha: float, models: int) -> list[Candidate
     places = range(fixed, len(state.adopted))
     promising = shared_out(lambda place: _promising(state, place, models), places)
     pairs = [(place, *pair) for place, found in zip(places, promising, strict=True) for pair in found]
-    found = shared_out(lambda pair: _assessed(state, *pair, alpha), pairs)
+    found = shared_out(lambda pair: _assessed(state, *pair[:3]), pairs)
     of_each: dict[int, list[Candidate]] = {}
-    for (place, *_), candidate in zip(pairs, found, strict=True):
+    for (place, name, _, tried), (here, terms, assessment) in zip(pairs, found, strict=True):
+        one, other = (_with(state.adopted[place], name, value) for value in here)
+        log_noise = brought_in(state, other.channels(state.excitation))
+        candidate = Candidate(
+            other, tried, terms, assessment, assessment.p * tried, assessment.own_p * tried, assessment.null_p * tried,
+            alpha, log_noise, explained_beside(state, other, terms, assessment), moved=(place, one),
+        )  # fmt: skip
         of_each.setdefault(place, []).append(candidate.among(models))
     return [max(several, key=lambda c: c.assessment.gain.total) for several in of_each.values()]
 
@@ -104,8 +110,10 @@ def _with(model: Adopted, name: str, value: float) -> Adopted:
     return replace(model, settings={**model.settings, **at_rest, name: value})
 
 
-def _assessed(state: State, place: int, name: str, pair: tuple[float, float], tried: int, alpha: float) -> Candidate:
-    """The two, their settings refined, and what they explain beside what is adopted."""
+def _assessed(
+    state: State, place: int, name: str, pair: tuple[float, float]
+) -> tuple[tuple[float, float], Terms, Assessment]:
+    """The two with their settings refined: these, their terms, and what they explain beside what is adopted."""
     model = state.adopted[place]
     grid = sorted(profiled(model.component)[name].values(state.excitation))
     few = Thinned.of(state, REFINING_SAMPLES)
@@ -128,9 +136,4 @@ def _assessed(state: State, place: int, name: str, pair: tuple[float, float], tr
     one, other = (_with(model, name, value) for value in here)
     both = joined([m.terms(state.excitation).at(state.residual.samples) for m in (one, other)])
     now = Whitened.of(state.residual, state.colours.across, state.colours.along, state.terms)
-    assessment = assess(now, both)
-    log_noise = brought_in(state, model.channels(state.excitation))
-    return Candidate(
-        other, tried, both, assessment, assessment.p * tried, assessment.own_p * tried, assessment.null_p * tried,
-        alpha, log_noise, explained_beside(state, other, both, assessment), moved=(place, one),
-    )  # fmt: skip
+    return (here[0], here[1]), both, assess(now, both)
