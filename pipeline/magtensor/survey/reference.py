@@ -87,8 +87,9 @@ def spikes(values: Floats, threshold: float, time: Floats | None = None) -> Bool
     The cubic tells a spike from a pulsation; the neighbours and the median tell it from a step, and the neighbours do
     so where the record is steep. Each deviation's scale is 1.4826 times its median magnitude over the whole record, or
     what the upper quartile of the magnitudes around the sample would be the scale of, if that is larger; and at least
-    the record's resolution: a proton magnetometer that rounds to 0.1 nT repeats itself for long. Where spikes are
-    found it is asked once more without them, for a few of them make a quiet record seem active around them. Samples on
+    the record's resolution: a proton magnetometer that rounds to 0.1 nT repeats itself for long. The scale from the
+    cubic is that of the record without the samples that look like lone spikes in the quiet part of it, and where spikes
+    are found it is asked once more without them: some of them make a quiet record seem active around them. Samples on
     the two sides of a gap are no neighbours. The last two before one, and of the record, are spikes by the
     median alone: a steep record may end there.
 
@@ -127,7 +128,7 @@ def _spikes_among(values: Floats, pieces: list[slice], threshold: float, least: 
     strays = by_piece(_strays, values)
     rough = np.abs(strays)
     lone = by_piece(_left_beside, strays) < LEFT_BESIDE * rough
-    # each makes four others stray: of some in a hundred samples a quarter of all would, and hide them
+    # each makes four others stray: where one sample in twenty is a spike a quarter of all do, and would hide them
     suspects = lone & (rough > threshold * max(1.4826 * float(np.median(rough)), least))
     usual = np.concatenate([_bridged(values[p], suspects[p]) for p in pieces])
     limit = threshold * _scale(np.abs(by_piece(_strays, usual)), least)
