@@ -21,7 +21,7 @@ LEAST_FREEDOM = 3.0  # of a steady variation none is left, and a drift of the ba
 NEARBY_S = 2.0  # shorter delays show as the slope over this time
 LONGEST_S = 7200.0  # two time zones
 BETWEEN_NOISE_AND_DELAY = 0.75  # of the lag: half of it is what noise makes, all of it a delay
-AS_RESTLESS = 0.5  # times the size of the recorded variation, at least, that of the readings which would be right
+AS_RESTLESS = 0.25  # times the size of the recorded variation, at least, that of the readings which would be right
 
 
 def _more_than_noise(x: Excitation, _: Mapping[str, Any], coefficients: Array, explained: float) -> bool:
