@@ -118,7 +118,7 @@ def sentence(outcome: dict[str, Any]) -> str:
     elif left["present"]:
         head = f"Calibrated with {model}; a residual remains that no known effect explains"
     else:
-        head = f"Calibrated with {model}; nothing is left that asks for another effect"
+        head = f"Calibrated with {model}; what is left looks like noise and asks for no other effect"
     noted = str(left["description"] or "").partition("; ")[2] if left["present"] is False else ""
     tail = f"; unexplained: {left['description']}" if left["present"] else f"; noted: {noted}" if noted else ""
     doubt = outcome.get("calibration", {}).get("description", "")
@@ -202,7 +202,7 @@ def _disagreement(outcome: dict[str, Any]) -> str:
     if contradicted:
         return f"; |b| would be nearer to the verification survey's total field without {contradicted}"
     if not apart:
-        return _carried_over(held_out, verify) or _of_the_tensor(held_out, verify)
+        return _carried_over(held_out, verify) or _of_the_tensor(held_out, verify, outcome["noise_floor_nT"])
     each = {s: v for s, v in after.items() if s != "all" and v is not None and here.get(s)}
     sensors = [s for s, v in each.items() if v > DISAGREES * here[s]]
     where = f" of {', '.join(sensors)}" if 0 < len(sensors) < len(each) else ""
@@ -236,11 +236,13 @@ def _beyond(verify: dict[str, Any]) -> str:
     return f" ({beyond})" if (beyond := verify.get("extrapolated")) else ""
 
 
-def _of_the_tensor(held_out: dict[str, Any], verify: dict[str, Any]) -> str:
+def _of_the_tensor(held_out: dict[str, Any], verify: dict[str, Any], floor: float | None) -> str:
     """Words where |b| of a verification survey is as it was on held-out blocks and the tensor is not: a sensor that
-    repeats a vector, or one that was turned, has the right length."""
+    repeats a vector, or one that was turned, has the right length. Of sensors that are louder there, in |b| too, it is
+    no more than that."""
     here, there = (_of_all(b.get("after") or {}, "tensor_rms_nT_per_m") for b in (held_out, verify))
-    if not 0.0 < DISAGREES * here < there:
+    louder = max(_of_all(verify["after"], "total_field_rms_nT") / floor, 1.0) if floor else 1.0
+    if not 0.0 < DISAGREES * here * louder < there:
         return ""
     return (
         f"; the verification survey's tensor errs by {round(there / here)} times as much as on held-out blocks, its "

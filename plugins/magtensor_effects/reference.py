@@ -145,12 +145,18 @@ def reference_drift(x: Excitation, *, order: Order = 1, span_s: Span = 3600.0, l
     return joined([x.on_reference(course - (-1.0) ** k, "nT", f"P{k}") for k, course in named])
 
 
+def _or_at_the_site(x: Excitation, _: Mapping[str, Any], __: Mapping[tuple[str, str], float]) -> str:
+    """Where else something magnetic may have been put, or taken away: where all sensors see it alike."""
+    return "in |b| - F alone: it may have happened at the site instead"
+
+
 @error_model(
     "reference",
     needs=("base_station",),
     source="shift in level",
     typical="any: the station's new place",
     pointwise=True,
+    means=_or_at_the_site,
 )
 def reference_step(x: Excitation, *, time_s: EventTime = 0.0) -> Terms:
     """The base station was moved or retuned: its total field jumps at a time.
@@ -168,6 +174,7 @@ def reference_step(x: Excitation, *, time_s: EventTime = 0.0) -> Terms:
     source="two shifts in level of opposite sign",
     typical="some nT: a car parked beside the station, a tool left at its sensor, a sensor moved and put back",
     pointwise=True,
+    means=_or_at_the_site,
 )
 def reference_while(x: Excitation, *, time_s: OneTime = 0.0, until_s: OtherTime = 60.0) -> Terms:
     """The base station's level is another one between two times: something magnetic stood beside it.

@@ -184,9 +184,9 @@ def flicker(rng: np.random.Generator, shape: tuple[int, ...], crossing: float = 
     return slow + rng.standard_normal(shape)
 
 
-def looked_at(state: State, model: Adopted) -> Candidate:
-    """A model as a candidate, its settings given."""
+def looked_at(state: State, model: Adopted, *, once: bool = False) -> Candidate:
+    """A model as a candidate, its settings given; `once` if it is of something that happens once."""
     terms = model.terms(state.excitation).at(state.residual.samples)
     white = Whitened.of(state.residual, state.colours.across, state.colours.along, state.terms)
-    found = assess(white, terms)
+    found = assess(white, terms, once=once)
     return Candidate(model, 1.0, terms, found, found.p, found.own_p, found.null_p)

@@ -31,6 +31,13 @@ def test_it_is_found_with_its_size(seed: int, tmp_path: Path) -> None:
     assert float(found[2]) == pytest.approx(0.3, rel=0.25)
 
 
+@pytest.mark.parametrize("sensors", [["S2"], ["S1", "S2", "S3", "S4"]])
+def test_of_all_sensors_none_is_singled_out(sensors: list[str], tmp_path: Path) -> None:
+    effects = [{"type": "jitter", "rms_nT": 0.3, "sensors": [sensor]} for sensor in sensors]
+    (words,) = jitter_words(linear_state(loaded(tmp_path, scenario(102, *effects))))
+    assert words.startswith("the noise of all sensors grows" if len(sensors) > 1 else "the noise of S2 grows")
+
+
 @pytest.mark.parametrize("what", EFFECTS)
 @pytest.mark.parametrize("seed", [101, 102, 103])
 def test_nothing_else_is_taken_for_it(what: str, seed: int, tmp_path: Path) -> None:

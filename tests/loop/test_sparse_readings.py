@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import h5py
 import numpy as np
 import pytest
-from loop_cases import linear_state, loaded, scenario, verdict_of
+from loop_cases import adopted_names, linear_state, loaded, scenario, synthetic, verdict_of
 
-from magtensor.loop.remainder.sparse_readings import sparse_readings
+from magtensor.error_models.station import Station
+from magtensor.loop.fitting.model import Fitting
+from magtensor.loop.remainder.sparse_readings import FAR, as_far_as_unread, sparse_readings
+from magtensor.loop.searching.found import Search
+from magtensor.loop.searching.unexplained import strongest_line, unexplained
 
 LONG = pytest.mark.long
 
@@ -87,3 +92,56 @@ def test_what_passes_for_a_delay_and_is_none_is_no_rest(seed: int, tmp_path: Pat
     told = verdict_of(tmp_path, made, lambda path: without_readings(path, 130, 133), ["reference_clock"])
     assert not told["adopted"] and not told["unexplained"]["present"], told["unexplained"]["description"]
     assert "reference_clock: significant, but as noise of the base station" in told["unexplained"]["description"]
+
+
+PASSING = {"type": "passing_source", "closest_m": [12.0, 0.0, 0.0], "velocity_m_s": [0.0, 0.6, 0.0], "time_s": 405.0}
+
+
+@pytest.mark.parametrize(("duration_s", "passed"), [(800.0, False), (1200.0, True)])
+def test_what_passes_between_two_readings_is_more_than_the_field_moves(
+    duration_s: float, passed: bool, tmp_path: Path
+) -> None:
+    """Readings every 30 s of waves of 1 nT rms and 37 and 61 s; a source passes within 20 s, or none does."""
+    made = survey(605, 37.0, 1.0, rate_Hz=1.0 / 30.0)
+    made["motion"]["duration_s"] = duration_s
+    made["field"]["variation"] |= {
+        "pulsations": [{"rms_nT": 1.0, "period_s": period_s} for period_s in (37.0, 61.0)],
+        "irregular": {"rms_nT": 40.0, "time_s": 150.0},
+    }
+    made["effects"] = [{**PASSING, "rms_nT": 1.0}] if passed else []
+    told = verdict_of(tmp_path, made, None, ["passing_source", "reference_while", "reference_step", "offset_while"])
+    assert adopted_names(told) == ({"passing_source"} if passed else set())
+
+
+def test_how_far_the_field_moves_unread_is_known_from_readings_that_are_as_far_apart() -> None:
+    """The middle of a chord over a time T misses a wave of a period P and 3 nT rms by 3 nT (1 - cos(pi T / P)) rms."""
+    made = synthetic(3)
+    field = 50_000.0 + 3.0 * np.sqrt(2.0) * np.sin(2.0 * np.pi * made.time / 120.0)
+    at = made.time[::5]
+    read = np.delete(at, [130, 131, 132, 133])
+    record = replace(made, total_field=field, station=Station(read, np.interp(read, made.time, field)))
+    missed = 3.0 * (1.0 - np.cos(np.pi * 30.0 / 120.0))  # 15 s to either side, further beside the gap
+    assert as_far_as_unread(FAR * missed, 25.0, record) and not as_far_as_unread(1.3 * FAR * missed, 25.0, record)
+    assert not as_far_as_unread(FAR * missed, 5.0, record)
+    assert not as_far_as_unread(FAR * missed, 1190.0, record)  # no others tell
+
+
+@pytest.mark.parametrize("seed", [404, 405])
+def test_a_line_of_the_field_that_was_not_read_is_none_of_the_platform(seed: int) -> None:
+    """A wave of 33 s read every 10 s leaves images, which are lines where a platform's own would be that stays upright,
+    its tilts within some 30 degrees."""
+    rng = np.random.default_rng(seed)
+    made = synthetic(seed)
+    tilts = np.cumsum(rng.standard_normal((len(made.time), 2)), axis=0)
+    down = np.column_stack([0.4 * tilts / tilts.std(axis=0), np.ones(len(made.time))])
+    field = 50_000.0 + 3.0 * np.sin(2.0 * np.pi * made.time / 33.0)
+    seen = down / np.linalg.norm(down, axis=1, keepdims=True) * field[:, None]
+    raw = np.repeat(seen[:, None], 4, axis=1) + 0.2 * rng.standard_normal((len(made.time), 4, 3))
+    read = np.arange(0.0, 1201.0, 10.0)
+    station = Station(read, np.interp(read, made.time, field))
+    known = station.at(made.time)
+    record = replace(made, raw=raw, total_field=known, quiet_field=known, station=station)
+    state = linear_state(record)
+    assert strongest_line(state, record) is not None and strongest_line(state, record, between=True) is None
+    told = unexplained(Search(state, state, (), {}, {}, record, None, Fitting()), record)
+    assert not told["present"] and "read too seldom" in told["description"], told["description"]

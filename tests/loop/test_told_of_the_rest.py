@@ -387,3 +387,25 @@ def test_what_an_attitude_s_error_leaves_of_a_gradient_is_noted_and_not_unexplai
     assert [a["error_model"] for a in verdict["adopted"]] == ["site_gradient"]
     assert not verdict["unexplained"]["present"]
     assert "less than 5 % of what is adopted, whose laws may leave it" in verdict["unexplained"]["description"]
+
+
+@pytest.mark.parametrize(("louder", "of_the_tensor"), [(1.0, 4.0), (4.0, 4.0), (4.0, 16.0)])
+def test_a_tensor_that_errs_more_is_told_unless_the_sensors_are_louder(louder: float, of_the_tensor: float) -> None:
+    """The base station's noise of 0.3 nT makes |b| - F of the first survey, the sensors' own of 0.08 nT the tensor."""
+
+    def block(total: float, tensor: float) -> dict[str, Any]:
+        return {"total_field_rms_nT": {"all": total}, "tensor_rms_nT_per_m": {"all": tensor}}
+
+    here, there = block(0.31, 0.23), block(0.08 * louder, 0.23 * of_the_tensor)
+    outcome: dict[str, Any] = {
+        "declared": ["linear"],
+        "adopted": [],
+        "noise_floor_nT": 0.08,
+        "unexplained": {"present": False, "description": "nothing", "excess_rms_nT": 0.0, "looks_like": []},
+        "error": {
+            "fit": here,
+            "held_out": {"before": here, "after": here},
+            "verify": {"before": there, "after": there, "left_by_any_calibration_nT": 0.08 * louder},
+        },
+    }
+    assert ("tensor errs by" in sentence(outcome)) is (of_the_tensor > louder)

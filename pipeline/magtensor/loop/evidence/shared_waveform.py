@@ -16,7 +16,6 @@ from magtensor.loop.evidence.gains import Gain
 
 ALPHA = 0.001  # family-wise over the bands
 LEAST_BAND = 6  # coefficients of the lowest band for each value across
-_PARTS = 6  # of a band and of the survey, in which the noise of different values may have different power
 
 
 @dataclass(frozen=True)
@@ -59,15 +58,15 @@ def _effective(coefficients: Array, course: Array, covariance: Array) -> float:
 
 
 def _unevenness(values: Array, covariance: Array) -> float:
-    """By what factor fewer values (K, m) tell as much, where their powers rise and fall together from part to part.
+    """By what factor fewer values (K, m) tell as much, where their powers rise and fall together.
 
-    The covariance of two independent series of powers p and q varies as the mean of p q does.
+    The covariance of two independent series varies as the mean product of their squares does.
     """
     values = values / np.sqrt(max(float(np.mean(values**2)), 1e-300) * len(covariance) / np.trace(covariance))
     powers, vectors = np.linalg.eigh(covariance)
     unit = values @ (vectors / np.sqrt(np.maximum(powers, 1e-12 * powers[-1])))
-    power = np.stack([np.mean(part**2, axis=0) for part in np.array_split(unit, _PARTS)])
-    products = power.T @ power / _PARTS
+    square = unit**2
+    products = square.T @ square / len(square)
     m = len(covariance)
     alike = (products.sum() - np.trace(products)) / (m * (m - 1))
     return max(float(alike), 1.0)

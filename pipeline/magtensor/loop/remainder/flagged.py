@@ -10,7 +10,7 @@ from magtensor.in_a_row import in_a_row
 from magtensor.loop.evidence.own_noise import OwnNoise
 from magtensor.loop.fitting.model import Record, State, unread
 from magtensor.loop.fitting.refit import everywhere
-from magtensor.loop.remainder.sparse_readings import SparseReadings
+from magtensor.loop.remainder.sparse_readings import SparseReadings, as_far_as_unread, between_readings
 from magtensor.loop.remainder.switches import switched_at
 
 LONGEST_SPIKE = 2  # samples: what lasts longer is no accident of the recording
@@ -130,11 +130,26 @@ def flagged_words(
         f"calibration, by {amount:.3g} nT rms{where}: they are flagged and have no part in the calibration"
         f"{_at_an_end(flagged, state, record)}{between_switches(flagged, state)}"
     )
-    if sparse is not None and alike and sparse.between_readings(flagged, record):
-        return f"{words}; they lie between two readings of the base station", True
+    if alike and record.station is not None and between_readings(flagged, record):
+        away = np.abs(every.along / every.reference_gain) if every.along is not None else np.zeros(len(flagged))
+        if sparse is not None or _as_unread(away, flagged, record):
+            return f"{words}; they lie between readings of the base station", True
     if amount > FAR * usual:
         return words, False
     return f"{words}; slow noise, of {usual:.3g} nT rms there, may go as far", True
+
+
+def _as_unread(away: Array, flagged: Mask, record: Record) -> bool:
+    """Whether the field may have moved as far away (N,) nT in each run of flagged samples, which the base station did
+    not read meanwhile."""
+    assert record.station is not None
+    readings = record.station.time
+    for begin, end in in_a_row(flagged):
+        after = int(np.clip(np.searchsorted(readings, record.time[begin], side="right"), 1, len(readings) - 1))
+        span = float(readings[after] - readings[after - 1])
+        if not as_far_as_unread(float(away[begin:end].max()), span, record):
+            return False
+    return True
 
 
 def between_switches(flagged: Mask, state: State) -> str:

@@ -15,11 +15,13 @@ ALPHA = 0.001  # for all sensors together
 BLOCKS = 20
 LEAST_PER_BLOCK = 30
 LEAST_OF_ALL = 0.01  # of the power of all that is left in it: slow noise that is far stronger turns, too
+ALIKE = 0.4  # of the power in the sensor that has most, in each other: of three, one alone makes a quarter of it
 LEAST_SHARE = 0.25  # of the power of the sensor's noise: less is made by what turns, too, and is not white
 
 
 def jitter_words(state: State) -> list[str]:
-    """The sensor whose stamps scatter most, by how much, and what that adds to its noise; nothing where none do."""
+    """The sensor whose stamps scatter most, by how much, and what that adds to its noise; all of them where those of
+    the others scatter about as much; nothing where none do."""
     from scipy.special import stdtrit
 
     residual, x = state.residual, state.excitation
@@ -41,6 +43,12 @@ def jitter_words(state: State) -> list[str]:
         return []
     scatter = float(np.sqrt(mean[worst]))
     amount = scatter * float(np.sqrt(np.mean((slope[:, worst] * residual.noise.reshape(-1, 3)[worst]) ** 2)))
+    if np.all(mean > ALIKE * mean[worst]):
+        return [
+            f"the noise of all sensors grows with how fast the field turns in them, of {x.sensors[worst]} by "
+            f"{amount:.3g} nT rms, as if samples were taken early or late by {1e3 * scatter:.3g} ms at random, of each "
+            "sensor by itself: what trembles more where the platform turns faster would look the same"
+        ]
     return [
         f"the noise of {x.sensors[worst]} grows with how fast the field turns in it, by {amount:.3g} nT rms, as if its "
         f"samples were taken early or late by {1e3 * scatter:.3g} ms at random"

@@ -1,4 +1,4 @@
-"""Something that happened once, seen beside samples that were taken out because nothing explains them.
+"""Something that happened once, seen beside samples that were taken out: nothing explains them, or they are loud.
 
 What is left of a hump whose top has gone is two slopes, and an event whose shape is not asked for in between follows
 them closely. What acts where samples were taken out has to be significant with these in their place as well.
@@ -13,7 +13,7 @@ from magtensor.loop.fitting.model import State
 from magtensor.loop.searching.contribution import happens_once
 from magtensor.loop.searching.gates import Candidate
 
-OF_A_HOLE = "with the samples in their place that fit no calibration it is no more than noise"
+OF_A_HOLE = "with the samples in their place that were taken out it is no more than noise"
 
 
 def of_a_hole(chosen: Candidate, without: State, whole: State, models: int) -> str:

@@ -18,6 +18,7 @@ from magtensor.loop.remainder.curve_of_a_channel import event_of_a_curve
 from magtensor.loop.searching.adopting import adopt, on_all_sensors, polished
 from magtensor.loop.searching.after_a_pause import left_by_a_pause
 from magtensor.loop.searching.beginnings import at_its_limit, began_with_a_vector
+from magtensor.loop.searching.between_readings import BETWEEN, between_readings
 from magtensor.loop.searching.contribution import (
     a_tone,
     agrees,
@@ -164,6 +165,8 @@ def why_not(record: Record, before: Trial, after: Trial, chosen: Candidate, how:
         return "fitted together with the others, it leaves more than it takes away"
     theta = chosen.assessment.theta[-chosen.terms.count :]
     seen = chosen.before or before.state  # at the samples of its terms
+    if between_readings(record, after.state, which):
+        return BETWEEN
     if happens_once(model):
         if between_its_flanks(after.state, which):
             return "samples between its times fit no calibration: it is what is seen beside them"

@@ -55,6 +55,7 @@ from magtensor.loop.searching.likeness import (
 
 LEAST_SENSORS = 3  # from here on noise of single sensors does not imitate a factor
 QUIET = 5.0  # times the median square of a step: of a few dozen values none is as large by chance
+ASKED = 5  # times of one survey: in each round, and once more without the samples or the effects that are left out
 LEVEL_ROUNDS = 3
 MOST_RENEWALS = 10
 SETTLED = 0.1  # of the noise of a sample, along the vectors of a source
@@ -103,7 +104,7 @@ class Sought:
     @property
     def significant(self) -> bool:
         """Whether it is there."""
-        return self.p < ALPHA and not self.of_the_log
+        return self.p * ASKED < ALPHA and not self.of_the_log
 
 
 def sought(state: State, record: Record, *, may_follow: bool = False) -> Sought | None:

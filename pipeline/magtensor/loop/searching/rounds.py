@@ -93,7 +93,8 @@ class Rounds:
     Attributes:
         models, most_effects, alpha, lines, say: as in `search`; fixed: how many models were declared.
         failed: model -> why its regressors could not be made.
-        whole: the fit with the samples that were taken out because nothing explains them; None where none were.
+        whole: the fit with the samples that were taken out because nothing explains them, or they are loud; None where
+            none were.
     """
 
     models: Sequence[Component]

@@ -132,7 +132,7 @@ def _without_what_is_loud(ended: Ended, rounds: Rounds) -> Ended:
         state = joint_state(ended.record, ended.state.adopted, how, ended.state.theta, ended.state.lines)
     except DataError:  # the others do not determine a calibration by themselves
         return ended
-    again = rounds.run(ended.record, state, how)
+    again = replace(rounds, whole=ended.state).run(ended.record, state, how)
     return replace(again, steps=(*ended.steps, *again.steps))
 
 

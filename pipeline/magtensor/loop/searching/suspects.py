@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+
+import numpy as np
 
 from magtensor.calibration.types import Mask
-from magtensor.loop.evidence.assessment import assess
+from magtensor.error_models.terms import joined
+from magtensor.loop.evidence.assessment import assess, estimated
 from magtensor.loop.evidence.grams import Whitened
+from magtensor.loop.evidence.own_noise import OwnNoise
+from magtensor.loop.evidence.residual import taken_off
 from magtensor.loop.fitting.model import State
 from magtensor.loop.remainder.sparse_readings import SparseReadings
+from magtensor.loop.searching.beside_a_hole import OF_A_HOLE
+from magtensor.loop.searching.between_readings import BETWEEN
 from magtensor.loop.searching.contribution import happens_once, moments
 from magtensor.loop.searching.found import Search
 from magtensor.loop.searching.gates import SECOND_ORDER, Candidate
@@ -18,6 +25,7 @@ from magtensor.loop.searching.keeping import NOT_AS_ASSUMED
 ALPHA = 0.001  # of noise that explains a model, whatever the model predicts
 NEAR = 0.05  # corrected p value of what is said to come near
 MOST_NEAREST = 5
+LEAST_SHOWN = 1e-6  # of the largest singular value, of series beside the field
 
 
 @dataclass(frozen=True)
@@ -46,6 +54,7 @@ class Suspects:
         known: Mask,
         sparse: SparseReadings | None,
         loud: Sequence[tuple[float, float]],
+        alike: bool,
     ) -> Suspects:
         """Of a search that has ended.
 
@@ -53,6 +62,7 @@ class Suspects:
         ----------
         flagged: (N,) samples that no calibration fits; known: (N,) the same of which it is known why.
         loud: begin and end, s after the start, of louder noise: an event in it that predicts nothing is a part of that.
+        alike: whether all sensors see what is left alike.
         """
         last = found.steps[-1].candidates if found.steps else ()
         last = tuple(c for c in last if c.passes or not _in_one_of(loud, c))
@@ -64,11 +74,14 @@ class Suspects:
             last = tuple(c for c in last if _still_significant(c, found.told, NEAR))
         reference = [c for c in last if c.model.component.effect == "reference"]
         noisy = {c.model.name for c in reference if refused.get(c.model.name) == NOT_AS_ASSUMED}
+        noisy |= {name for name, why in refused.items() if why in (BETWEEN, OF_A_HOLE)}
         if sparse is not None:
             noisy |= {c.model.name for c in reference if not c.passes}
         suspects = [
             c for c in seen
             if c.model.name not in noisy and not (c.of_the_log or c.of_second_order or c.of_the_law)
+            and (c.passes or not (alike and seen_alike_alone(c, found.told)))
+            and (c.passes or not within_the_noise_there(c, found.told))
         ]  # fmt: skip
         adopted = {a.name for a in found.last.adopted}
 
@@ -124,6 +137,53 @@ def _in_one_of(stretches: Sequence[tuple[float, float]], candidate: Candidate) -
     """Whether what happened once did so within one stretch."""
     when = moments(candidate.model) if happens_once(candidate.model) else []
     return bool(when) and any(begin <= when[0] and when[-1] <= end for begin, end in stretches)
+
+
+def seen_alike_alone(candidate: Candidate, state: State) -> bool:
+    """Whether an event of the sensors is asked for by |b| - F alone: where all of what is left there is seen by all of
+    them alike, the base station errs, or a field that it does not see moves."""
+    residual = state.residual
+    if not (happens_once(candidate.model) and candidate.model.component.effect == "instrument"):
+        return False
+    terms = candidate.model.terms(state.excitation).at(residual.samples)
+    between = OwnNoise(replace(residual, along=None, sighted=None), state.terms).p_value(terms)
+    return between * _corrected(candidate) >= candidate.alpha
+
+
+def within_the_noise_there(candidate: Candidate, state: State) -> bool:
+    """Whether what happened once is no more than the noise at the samples that tell of it, where that is louder than
+    the average: by so much less of it shows.
+
+    Those tell of it in which its terms have something that C and o could not follow.
+    """
+    from scipy.special import chdtrc, chdtri
+
+    residual, p = state.residual, _p(candidate)
+    if not happens_once(candidate.model) or p <= 0.0:
+        return False
+    terms = candidate.model.terms(state.excitation).at(residual.samples)
+    together = terms if state.terms is None else joined([state.terms, terms])
+    left = taken_off(residual, together, estimated(residual, together, state.colours).theta)
+    parts = [part.reshape(len(part), -1) for part in (left.across, left.along) if part is not None]
+    square = np.sum(np.hstack(parts) ** 2, axis=1)
+    known = np.linalg.qr(residual.affine)[0]
+    beside = terms.series - known @ (known.T @ terms.series)
+    rows, size, _ = np.linalg.svd(beside, full_matrices=False)
+    tells = np.sum(rows[:, size > LEAST_SHOWN * size[0]] ** 2, axis=1)
+    louder = float(tells @ square) / float(tells @ (1.0 - tells)) / float(square.mean())
+    if louder <= 1.0:
+        return False
+    return float(chdtrc(terms.count, chdtri(terms.count, p) / louder)) * _corrected(candidate) >= candidate.alpha
+
+
+def _p(candidate: Candidate) -> float:
+    return max(candidate.assessment.p, candidate.assessment.own_p)
+
+
+def _corrected(candidate: Candidate) -> float:
+    """By what factor a p value grows for all that was tried."""
+    p = _p(candidate)
+    return max(candidate.adjusted_p, candidate.adjusted_own_p) / p if p > 0.0 else candidate.tried
 
 
 def unlikely(candidate: Candidate) -> bool:

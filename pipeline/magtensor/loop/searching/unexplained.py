@@ -64,7 +64,7 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
     played, began = before_the_play(bad, state)
     flagged = lasting(bad, played) | starts
     loud = Loud.of(state, record, found.how)
-    suspects = Suspects.of(found, flagged, played, sparse, loud.stretches)
+    suspects = Suspects.of(found, flagged, played, sparse, loud.stretches, _seen_alike(state.residual))
     outlying = Outlying.of(state, record)
     too_often, theirs = outlying_words(outlying, ~np.asarray(state.fit.keep))
     words = [*_what_shows(found, record, excess, sparse), *suspects.words, *too_often]
@@ -117,7 +117,7 @@ def _what_shows(found: Search, record: Record, excess: float, sparse: SparseRead
     # noise that grows louder makes a small one by chance, which predicts nothing
     if shared is not None and shared.significant and (shared.gain.consistent or shared.share > OF_A_LINE):
         words.append(shared_words(shared, record.sensors))
-    line = strongest_line(state, record)
+    line = strongest_line(state, record, between=sparse is not None)
     # where the platform turns steadily, what is no tone has a small line too
     if line is not None and line[1] ** 2 >= OF_A_LINE * excess**2:
         theirs = list(channels_of_the_line(state.excitation, line[0]))
@@ -242,9 +242,11 @@ def _slow(state: State, record: Record) -> float:
     return max(slow_along(state) ** 2 - of_the_station(state, record) ** 2, 0.0) ** 0.5
 
 
-def strongest_line(state: State, record: Record) -> tuple[float, float] | None:
-    """Frequency in Hz and rms in nT of a spectral line that noise does not make; None without one."""
-    lines = spectral_lines(state.residual, record.time[state.residual.samples])
+def strongest_line(state: State, record: Record, *, between: bool = False) -> tuple[float, float] | None:
+    """Frequency in Hz and rms in nT of a spectral line that noise does not make; None without one. If asked for, of
+    what differs between the sensors alone."""
+    residual = replace(state.residual, along=None) if between else state.residual
+    lines = spectral_lines(residual, record.time[residual.samples])
     return (lines[0][0], lines[0][1]) if lines and lines[0][2] < ALPHA else None
 
 
