@@ -9,13 +9,16 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
-from loop_cases import adopted_names, linear_state, loaded, scenario, synthetic, verdict_of
+from loop_cases import Array, adopted_names, linear_state, loaded, scenario, synthetic, verdict_of
 
 from magtensor.error_models.station import Station
-from magtensor.loop.fitting.model import Fitting
+from magtensor.loop.fitting.model import Adopted, Fitting, Record
+from magtensor.loop.fitting.refit import joint_state
 from magtensor.loop.remainder.sparse_readings import FAR, as_far_as_unread, sparse_readings
+from magtensor.loop.searching.between_readings import between_readings
 from magtensor.loop.searching.found import Search
 from magtensor.loop.searching.unexplained import strongest_line, unexplained
+from magtensor.registry import Registry
 
 LONG = pytest.mark.long
 
@@ -126,22 +129,44 @@ def test_how_far_the_field_moves_unread_is_known_from_readings_that_are_as_far_a
     assert not as_far_as_unread(FAR * missed, 1190.0, record)  # no others tell
 
 
-@pytest.mark.parametrize("seed", [404, 405])
-def test_a_line_of_the_field_that_was_not_read_is_none_of_the_platform(seed: int) -> None:
-    """A wave of 33 s read every 10 s leaves images, which are lines where a platform's own would be that stays upright,
-    its tilts within some 30 degrees."""
+def upright(seed: int, read_s: float, wave_nT: Array, current_nT: Array) -> Record:
+    """A platform within some 30 degrees of upright, a wave (N,) in the field that is read every so often, and a current
+    (N,) on it that is not logged."""
     rng = np.random.default_rng(seed)
     made = synthetic(seed)
     tilts = np.cumsum(rng.standard_normal((len(made.time), 2)), axis=0)
     down = np.column_stack([0.4 * tilts / tilts.std(axis=0), np.ones(len(made.time))])
-    field = 50_000.0 + 3.0 * np.sin(2.0 * np.pi * made.time / 33.0)
+    field = 50_000.0 + wave_nT
     seen = down / np.linalg.norm(down, axis=1, keepdims=True) * field[:, None]
+    seen += current_nT[:, None] * np.array([0.3, -0.3, 0.9])
     raw = np.repeat(seen[:, None], 4, axis=1) + 0.2 * rng.standard_normal((len(made.time), 4, 3))
-    read = np.arange(0.0, 1201.0, 10.0)
+    read = np.arange(0.0, made.time[-1] + read_s, read_s)
     station = Station(read, np.interp(read, made.time, field))
     known = station.at(made.time)
-    record = replace(made, raw=raw, total_field=known, quiet_field=known, station=station)
+    return replace(made, raw=raw, total_field=known, quiet_field=known, station=station)
+
+
+def wave(period_s: float) -> Array:
+    return np.asarray(np.sin(2.0 * np.pi * np.arange(1200.0) / period_s))
+
+
+@pytest.mark.parametrize("seed", [404, 405])
+def test_a_line_of_the_field_that_was_not_read_is_none_of_the_platform(seed: int) -> None:
+    """A wave of 33 s read every 10 s leaves images, which are lines where a platform's own would be."""
+    record = upright(seed, 10.0, 3.0 * wave(33.0), np.zeros(1200))
     state = linear_state(record)
     assert strongest_line(state, record) is not None and strongest_line(state, record, between=True) is None
     told = unexplained(Search(state, state, (), {}, {}, record, None, Fitting()), record)
     assert not told["present"] and "read too seldom" in told["description"], told["description"]
+
+
+@pytest.mark.parametrize(("of_the_field", "period_s"), [(True, 6.17), (False, 6.17), (False, 5.05)])
+@pytest.mark.parametrize("seed", [407, 408])
+def test_the_image_of_a_wave_is_no_tone(seed: int, of_the_field: bool, period_s: float) -> None:
+    """A wave of 26.4 s read every 5 s has images at 4.2 and 6.17 s. A current of that period is there at the readings
+    too."""
+    still = np.zeros(1200)
+    record = upright(seed, 5.0, *((3.0 * wave(26.4), still) if of_the_field else (still, 0.1 * wave(period_s))))
+    model = Adopted(Registry.load().find("error_model", "periodic_interference"), {"frequency_Hz": 1.0 / period_s})
+    state = joint_state(record, [model], Fitting())
+    assert between_readings(record, state, 0) is of_the_field

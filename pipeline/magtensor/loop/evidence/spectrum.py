@@ -167,8 +167,9 @@ def _largest(
     is slow may be one effect."""
     from scipy.special import chdtri, fdtrc
 
-    k = coordinates.shape[1]
-    power = np.sum(np.abs(spectrum @ _alike(coordinates)) ** 2, axis=1) / grid.n
+    alike = _alike(coordinates)
+    k = alike.shape[1]
+    power = np.sum(np.abs(spectrum @ alike) ** 2, axis=1) / grid.n
     width = max(len(power) // 100, 15)
     smooth, lowest = _running_median(power, width), min(2 * width, len(power))
     ratio = power / np.maximum(smooth, 1e-300) * chdtri(2 * k, 0.5) / 2.0  # to the scale of k exponentials' sum
@@ -224,12 +225,16 @@ def transform(coordinates: Array, places: Array, n: int) -> NDArray[np.complex12
 
 
 def _alike(coordinates: Array) -> Array:
-    """(K, K) what makes the fast noise of coordinates (N, K) independent and alike, its mean variance kept: the largest
-    of sums of K squares is no line where one axis, louder than all others, makes nearly all of each sum."""
+    """(K, k) what makes the fast noise of coordinates (N, K) independent and alike, its mean variance kept: the largest
+    of sums of K squares is no line where one axis, louder than all others, makes nearly all of each sum. Axes without
+    any are left out, as all but one are of a direction that does not turn."""
     fast = np.diff(coordinates, n=2, axis=0)
     variance, axes = np.linalg.eigh(fast.T @ fast / len(fast))
-    least = np.maximum(variance, _LEAST_VARIANCE * variance[-1])
-    out: Array = axes / np.sqrt(least) * np.sqrt(variance.mean())
+    seen = variance > _LEAST_VARIANCE * variance[-1]
+    if not seen.any():
+        seen[-1] = True
+    least = np.maximum(variance[seen], 1e-300)
+    out: Array = axes[:, seen] / np.sqrt(least) * np.sqrt(variance.mean())
     return out
 
 
