@@ -123,7 +123,8 @@ def test_what_fails_alone_is_kept_if_both_help(
     looking = rounds.Rounds([], 0, 8, 0.005, None, None)
     hurt = Fitted(alone, "fitted, it raises the held-out error of S1", ("S1",))
     both = looking.with_another(given, before, first, hurt, given)
-    assert asked == [False]  # no third one is looked for
+    assert looking.with_another(given, before, first, hurt, given) is None
+    assert asked == [False]  # no third one is looked for, nor the second once more
     assert (both is not None) == kept
     if both is not None:
         assert both.standing is not None and both.standing.blocks is not None

@@ -93,6 +93,7 @@ class Rounds:
     Attributes:
         models, most_effects, alpha, lines, say: as in `search`; fixed: how many models were declared.
         failed: model -> why its regressors could not be made.
+        sought_beside: names of a candidate that failed alone, and of what was adopted, where another was sought too.
         whole: the fit with the samples that were taken out because nothing explains them, or they are loud; None where
             none were.
     """
@@ -104,6 +105,7 @@ class Rounds:
     lines: Sequence[float] | None
     say: Callable[[str], None] | None
     failed: dict[str, str] = field(default_factory=dict)
+    sought_beside: set[tuple[str, ...]] = field(default_factory=set)
     whole: State | None = None
 
     def candidates(self, state: State, record: Record, how: Fitting) -> list[Candidate]:
@@ -349,10 +351,14 @@ class Rounds:
         nothing is found, or both do not help the sensors that it hurts.
 
         Of two effects that follow one trend each is fitted with the other's part in it, and so predicts blocks worse
-        than none.
+        than none. Asked once beside what is adopted: other samples or fewer sensors show no other pair.
         """
+        asked = (chosen.model.name, *(a.name for a in before.state.adopted))
         if alone.after is None or len(alone.after.state.adopted) - self.fixed >= self.most_effects:
             return None
+        if asked in self.sought_beside:
+            return None
+        self.sought_beside.add(asked)
         state = with_lines(alone.after.state, record, self.lines)
         candidates = self.candidates(state, record, how)
         open_ = len(testable(state.excitation, self.models))
