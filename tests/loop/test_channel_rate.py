@@ -60,7 +60,7 @@ def test_a_current_and_its_rate_are_two_effects(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("tau_s", [6.0, 40.0])
+@pytest.mark.parametrize("tau_s", [pytest.param(6.0, marks=pytest.mark.long), 40.0])
 def test_a_kick_whenever_something_is_switched(tmp_path: Path, tau_s: float) -> None:
     kick: dict[str, Any] = {"type": "channel_rate", "channel": "current_heater", "tau_s": tau_s, "rms_nT": 0.6}
     told = verdict_of(tmp_path, scenario(32, kick), models=MODELS[:3])

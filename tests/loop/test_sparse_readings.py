@@ -100,7 +100,7 @@ def test_what_passes_for_a_delay_and_is_none_is_no_rest(seed: int, tmp_path: Pat
 PASSING = {"type": "passing_source", "closest_m": [12.0, 0.0, 0.0], "velocity_m_s": [0.0, 0.6, 0.0], "time_s": 405.0}
 
 
-@pytest.mark.parametrize(("duration_s", "passed"), [(800.0, False), (1200.0, True)])
+@pytest.mark.parametrize(("duration_s", "passed"), [(800.0, False), pytest.param(1200.0, True, marks=LONG)])
 def test_what_passes_between_two_readings_is_more_than_the_field_moves(
     duration_s: float, passed: bool, tmp_path: Path
 ) -> None:
