@@ -54,14 +54,19 @@ def test_no_converter_is_accused_by_noise(seed: int) -> None:
     assert converter_words(linear_state(synthetic(seed, 150, noise_nT=0.15))) == []  # too few to ask
 
 
-def test_noise_that_is_louder_for_a_while_is_dated() -> None:
+@pytest.mark.parametrize("sensors", [slice(2, 3), slice(0, 4)])
+def test_noise_that_is_louder_for_a_while_is_dated(sensors: slice) -> None:
+    """Of all sensors in one sentence."""
     rng = np.random.default_rng(3)
     added = np.zeros((SAMPLES, 4, 3))
-    added[1000:1400, 2] = 0.6 * rng.standard_normal((400, 3))
+    added[1000:1400, sensors] = 0.6 * rng.standard_normal((400, 4, 3))[:, sensors]
     record = synthetic(3, SAMPLES, turning_s=4.0, noise_nT=0.15, added=added)
     (words,) = Loud.of(linear_state(record), record, Fitting()).words
     begin, end = (float(words.split()[i]) for i in (1, 3))
-    assert "the noise of S3" in words and begin == pytest.approx(1000, abs=15) and end == pytest.approx(1400, abs=15)
+    assert ("the noise of S3" in words) is (sensors.start == 2) and ("all other sensors" in words) is (
+        sensors.stop == 4
+    )
+    assert begin == pytest.approx(1000, abs=15) and end == pytest.approx(1400, abs=15)
     quiet = synthetic(3, SAMPLES, turning_s=4.0, noise_nT=0.15)
     assert Loud.of(linear_state(quiet), quiet, Fitting()).words == []
 

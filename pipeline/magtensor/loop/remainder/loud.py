@@ -43,7 +43,9 @@ class Loud:
         elapsed = record.time[seen.samples] - record.start
         names = state.excitation.sensors
         each = [(name, slice(3 * number, 3 * number + 3)) for number, name in enumerate(names)]
-        told, stretches = [], []
+        told: list[str] = []
+        stretches: list[tuple[float, float]] = []
+        longest: dict[str, tuple[float, float, float, int]] = {}  # begin, end, times as loud, how many others
         for name, own in [(" and ".join(names), slice(None))] if len(names) == 2 else each:  # two have one contrast
             steps = np.sum(np.diff(seen.across[:, own], axis=0) ** 2, axis=1)
             rough = median_filter(steps, size=ABOUT, mode="mirror")
@@ -57,11 +59,8 @@ class Loud:
             stretches += [(float(elapsed[first]), float(elapsed[end])) for first, end in found]
             first, end = max(found, key=lambda stretch: stretch[1] - stretch[0])
             times = float(np.sqrt(np.median(rough[first:end]) / usual))
-            others = f", and in {len(found) - 1} shorter stretches" if len(found) > 1 else ""
-            told.append(
-                f"from {elapsed[first]:.5g} to {elapsed[end]:.5g} s the noise of {name} is {times:.2g} times as loud "
-                f"as usual{others}"
-            )
+            longest[name] = float(elapsed[first]), float(elapsed[end]), times, len(found) - 1
+        told += _stretch_words(longest, len(names))
         if how.without:
             count = int(np.sum(~how.among(record.time)))
             told.append(
@@ -69,6 +68,26 @@ class Loud:
                 "without them"
             )
         return cls(told, stretches)
+
+
+def _stretch_words(longest: dict[str, tuple[float, float, float, int]], sensors: int) -> list[str]:
+    """The longest stretch of each sensor in which it is loud; of all, where all have one, the longest."""
+    if not longest:
+        return []
+    each = list(longest.items())
+    if len(longest) == sensors > 2:
+        name, (begin, end, times, others) = max(each, key=lambda one: one[1][1] - one[1][0])
+        most = max(one[2] for one in longest.values())
+        where = ", and in other stretches" if others or len({one[:2] for one in longest.values()}) > 1 else ""
+        return [
+            f"from {begin:.5g} to {end:.5g} s the noise of {name} is {times:.2g} times as loud as usual{where}, and so "
+            f"is that of all other sensors for a while, up to {most:.2g} times"
+        ]
+    return [
+        f"from {begin:.5g} to {end:.5g} s the noise of {name} is {times:.2g} times as loud as usual"
+        + (f", and in {others} shorter stretches" if others else "")
+        for name, (begin, end, times, others) in each
+    ]
 
 
 def growing_words(name: str, steps: Array, elapsed: Array) -> list[str]:

@@ -20,6 +20,7 @@ LEAST_BLOCKS = 12  # of fewer no signs are as unlikely as asked for
 LEAST_PER_BLOCK = 30
 POWERS = (0.5, 1.0, 2.0)  # of the profile: what is faster than the readings, a random walk, a curve that bends evenly
 A_LITTLE = 2.0  # times the time between two readings, that others may be apart
+NOTHING = 0.01  # of what is midway
 FAR = 4.0  # times the rms of what others miss: no natural field moves as far meanwhile
 LEAST_READINGS = 10  # as far apart, that tell how far it moves
 EACH = 1.5  # samples to a reading: with fewer, few are far from one
@@ -41,10 +42,10 @@ class SparseReadings:
     @property
     def words(self) -> str:
         """What they say."""
+        at = f"{self.at:.3g} nT" if self.at > NOTHING * self.midway else "next to nothing"
         return (
             f"{self.midway:.3g} nT rms of |b| - F midway between the base station's readings, which are "
-            f"{self.step_s:.4g} s apart, and {self.at:.3g} nT at them: it is read too seldom for a field that moves so "
-            "fast"
+            f"{self.step_s:.4g} s apart, and {at} at them: it is read too seldom for a field that moves so fast"
         )
 
 

@@ -91,7 +91,7 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
     if words:
         in_use = " at the samples in use" if bad.mean() > MANY_FLAGGED else ""
         size = f"{excess:.3g} nT rms above the white noise{in_use}, {_where(state)}"
-        words.insert(0, size if excess else "in sum no more than the white noise, but no noise alone")
+        words.insert(0, size if excess else "no larger than the white noise in sum, but of a shape that noise has not")
     beside += [sparse.words] if sparse is not None else suspects.noise_words
     beside += [*suspects.small_words, *([began] if began else [])]
     beside += spike_words(outlying, bad & ~(lasting(bad) | starts | played | theirs))
