@@ -162,6 +162,9 @@ def test_what_another_width_of_an_adopted_law_explains_is_no_other_effect(
     one = why == ONE_OF_A_KIND
     assert tried == ["hysteresis", *([] if one else ["bandwidth"]), "eddy_current"]
     assert ("the law of hysteresis leaves" in found.refused["bandwidth"]) == one
+    del tried[:]
+    few = search.first_kept(given, given, [width, creep, other], given, 30, most_fits=1)
+    assert few.standing is None and tried == ["hysteresis"]
 
 
 def test_of_one_name_the_curve_of_another_channel_is_still_tried(monkeypatch: pytest.MonkeyPatch) -> None:

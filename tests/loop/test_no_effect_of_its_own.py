@@ -11,7 +11,7 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
-from loop_cases import Array, adopted_names, linear_state, scenario, synthetic, verdict_of
+from loop_cases import BASE, Array, adopted_names, linear_state, loaded, scenario, synthetic, verdict_of
 
 from magtensor.loop.fitting.errors_before_after import folds_for
 from magtensor.loop.fitting.model import Adopted, Fitting, Record, State
@@ -63,6 +63,23 @@ def test_kin_have_one_driver_and_one_sensor() -> None:
     assert explained_by_kin(state, rate, *assessed(state, rate, "S3")) == 0.0  # another sensor
     assert explained_by_kin(state, current, *assessed(state, current, "S2")) == 0.0  # another driver
     assert explained_by_kin(state, offset, *assessed(state, offset, "S2")) == 0.0  # more of the same has another lag
+
+
+@pytest.mark.parametrize(
+    ("name", "settings", "cut_off"), [("fixed_source", {"degree": 4}, True), ("site_gradient", {}, False)]
+)
+def test_what_a_source_lacks_beyond_its_degree_follows_the_field(
+    name: str, settings: dict[str, Any], cut_off: bool, tmp_path: Path
+) -> None:
+    effect = {"type": "fixed_source", "rms_nT": 3.0, "position_m": [0.8, 0.3, -0.6]}
+    motion = BASE["motion"] | {"duration_s": 600.0}
+    record = loaded(tmp_path, scenario(61, effect, motion=motion, logging={"attitude": True}))
+    state = joint_state(record, [model(name, **settings)], Fitting())
+    bent, warm = model("nonlinearity_cubic", of_field=False), model("temperature_scale", channel="temperature")
+    elsewhere = model("position_error")
+    assert (explained_by_kin(state, bent, *assessed(state, bent, "S2")) > 1e4) is cut_off
+    assert explained_by_kin(state, elsewhere, *assessed(state, elsewhere, "S2")) == 0.0
+    assert explained_by_kin(state, warm, *assessed(state, warm, "S2")) == 0.0
 
 
 @pytest.mark.parametrize("kin", [False, True])

@@ -115,8 +115,8 @@ def test_what_fails_alone_is_kept_if_both_help(
     monkeypatch.setattr(rounds.Rounds, "candidates", lambda *_: [second])
     asked: list[bool] = []
 
-    def first_kept(self: Any, record: Any, state: Any, found: Any, how: Any, models: int, *, with_others: bool) -> Any:
-        asked.append(with_others)
+    def first_kept(self: Any, record: Any, state: Any, found: Any, how: Any, models: int, **others: Any) -> Any:
+        asked.append(others["with_others"])
         return rounds.Kept(standing(after, 2), second)
 
     monkeypatch.setattr(rounds.Rounds, "first_kept", first_kept)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from magtensor.error_models.waveform import NAME
 from magtensor.loop.fitting.model import Fitting, Record, State
+from magtensor.loop.fitting.trial import Trial
 from magtensor.loop.searching.contribution import removal
 from magtensor.loop.searching.gates import Candidate
 from magtensor.loop.searching.latent import Sought
@@ -38,6 +39,34 @@ class Step:
     channels: tuple[str, ...] = ()
     like: str = ""
     screened: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Kept:
+    """The outcome of a round.
+
+    Attributes:
+        standing: how the fit stands; None where nothing was kept.
+        chosen, rivals, channels, dropped, refused: as in `Step`.
+        then: the step of what was adopted with it, or nothing.
+    """
+
+    standing: Trial | None
+    chosen: Candidate | None = None
+    rivals: tuple[str, ...] = ()
+    channels: tuple[str, ...] = ()
+    dropped: tuple[str, ...] = ()
+    refused: Mapping[str, str] = field(default_factory=dict)
+    then: tuple[Step, ...] = ()
+
+    def step(self, before: State, candidates: Sequence[Candidate]) -> Step:
+        """The round's story; what follows another channel than its candidate did stands in its place, and a curve that
+        was none of the candidates behind them."""
+        kept = self.chosen
+        told = tuple(kept if kept and c.model.name == kept.model.name else c for c in candidates)
+        if kept and all(c is not kept for c in told):
+            told = (*told, kept)
+        return Step(before, told, kept, self.rivals, self.dropped, self.refused, channels=self.channels)
 
 
 @dataclass(frozen=True)

@@ -30,6 +30,7 @@ POWERS = 6  # of time and of a channel: more than any law of an effect that has 
 NEXT = 2  # samples: that a jump seems to be away while another part of it has no name
 MISSED = 0.01  # of the squares of an event that is held by another: some samples between the two
 TIME = " time"  # no channel has that name
+DEGREE = "degree"  # of a field of the site that is cut off there: what it lacks goes with the attitude
 
 
 def explained_beside(state: State, model: Adopted, terms: Terms, assessment: Assessment) -> float:
@@ -53,7 +54,8 @@ def explained_beside(state: State, model: Adopted, terms: Terms, assessment: Ass
 
 def explained_by_kin(state: State, model: Adopted, terms: Terms, assessment: Assessment) -> float:
     """Sum of squares that adopted effects of another name explain which have the candidate's sensors and driver, or no
-    law that anybody wrote where it happens once: its time was sought in all that such a response leaves."""
+    law that anybody wrote where it happens once: its time was sought in all that such a response leaves; or which are a
+    field of the site to some degree, where the candidate follows the field alone: what is beyond does, too."""
     return _explained(state, drivers(model, state.excitation), model, terms, assessment)
 
 
@@ -82,7 +84,11 @@ def _explained(
         and not _of_one_moment(model, other, state.excitation)
         and not _holds(model, terms, state, place)
         and not (between and other.component.effect == "reference")
-        and (by & drivers(other, state.excitation) or (generic(other) and happens_once(model)))
+        and (
+            by & drivers(other, state.excitation)
+            or (generic(other) and happens_once(model))
+            or (DEGREE in other.settings and _of_the_field_alone(model, state.excitation) and not _of_a_gradient(model))
+        )
         and _held_by(other.sensors or state.excitation.sensors, state, terms, assessment) > NEARLY_ALL
         and may_be_its_law(other, terms, theta, state)
     ]
@@ -161,6 +167,11 @@ def _of_the_field_alone(model: Adopted, x: Excitation) -> bool:
     component = model.component
     known = all(need in FACTS for need in component.declared({}).needs)
     return component.effect == "instrument" and known and not (a_tone(model) or generic(model) or drivers(model, x))
+
+
+def _of_a_gradient(model: Adopted) -> bool:
+    """Whether a model acts only in a field that is not uniform: on what a field of the site is, and not beside it."""
+    return "gradient" in model.component.declared({}).needs
 
 
 def _of_time(grid: Any) -> bool:

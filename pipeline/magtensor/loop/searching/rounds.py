@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -18,7 +18,7 @@ from magtensor.loop.searching.beside_a_hole import of_a_hole
 from magtensor.loop.searching.contribution import eliminate, tones_of, without_models
 from magtensor.loop.searching.course_of_time import beside_time, responses_like, rivals_in_time
 from magtensor.loop.searching.exchange import exchanged, looked_at_again
-from magtensor.loop.searching.found import Step
+from magtensor.loop.searching.found import Kept, Step
 from magtensor.loop.searching.gates import Candidate
 from magtensor.loop.searching.keeping import (
     MAYBE_HEAT,
@@ -57,6 +57,7 @@ from magtensor.loop.searching.unknown_rate import rate_instead
 from magtensor.loop.searching.which_channel import nearest
 
 ROUNDING = 1e-4  # mean square of the whitened residual: far below the least noise that any sensor is believed to have
+MOST_BESIDE = 2  # fits of another beside what fails alone: of two that hinder each other each is the first to be seen
 AS_LASTING = "{}, which lasts, predicts as much"
 
 
@@ -200,15 +201,16 @@ class Rounds:
         models: int,
         *,
         with_others: bool = True,
+        most_fits: int | None = None,
     ) -> Kept:
-        """Fit the candidates that pass, found among so many models, the best first, until one is kept; one that fails
-        on held-out blocks, before it is fitted or after, may be kept with another beside it."""
+        """Fit the candidates that pass, found among so many models, the best first, until one is kept, or so many have
+        been; one that fails on held-out blocks, before it is fitted or after, may be kept with another beside it."""
         refused: dict[str, str] = {}
         asked: set[str] = set()  # channels whose curves have had their turn
         outdone: list[Candidate] = []
         courses: list[Candidate] = []  # that are no more than smooth courses of time
         anything = next((m for m in self.models if m.name == CHANNEL), None)
-        left = list(candidates)
+        left, fits = list(candidates), 0
 
         def refuse(name: str, why: str) -> None:
             refused[name] = why
@@ -271,6 +273,8 @@ class Rounds:
             rivals = tuple(sorted({*rivals, *alike}))
             if not time.seen:
                 rivals = tuple(sorted({*rivals, *rivals_in_time(chosen, possible, before.state)}))
+            if (fits := fits + 1) > (most_fits or fits):
+                break
             if self.say is not None:
                 self.say(f"adopting {chosen.model.name}")
             tried, dropped = self.eliminated(record, before, chosen, fitted(record, before, chosen, how), how)
@@ -354,15 +358,16 @@ class Rounds:
         than none. Asked once beside what is adopted: other samples or fewer sensors show no other pair.
         """
         asked = (chosen.model.name, *(a.name for a in before.state.adopted))
-        if alone.after is None or len(alone.after.state.adopted) - self.fixed >= self.most_effects:
+        if alone.after is None or asked in self.sought_beside:
             return None
-        if asked in self.sought_beside:
+        if len(alone.after.state.adopted) - self.fixed >= self.most_effects:
             return None
         self.sought_beside.add(asked)
         state = with_lines(alone.after.state, record, self.lines)
         candidates = self.candidates(state, record, how)
         open_ = len(testable(state.excitation, self.models))
-        second = self.first_kept(record, replace(alone.after, state=state), candidates, how, open_, with_others=False)
+        standing, few = replace(alone.after, state=state), MOST_BESIDE
+        second = self.first_kept(record, standing, candidates, how, open_, with_others=False, most_fits=few)
         both = second.standing
         if both is None or second.dropped:
             return None
@@ -408,34 +413,6 @@ class Rounds:
             record, state = renewed(record, last, how)
         gone = (*([instead] if instead else []), *(() if NAME in dropped else dropped))
         return None, (record, state, replace(step, adopted=source.evidence, dropped=gone, like=source.like))
-
-
-@dataclass(frozen=True)
-class Kept:
-    """The outcome of a round.
-
-    Attributes:
-        standing: how the fit stands; None where nothing was kept.
-        chosen, rivals, channels, dropped, refused: as in `Step`.
-        then: the step of what was adopted with it, or nothing.
-    """
-
-    standing: Trial | None
-    chosen: Candidate | None = None
-    rivals: tuple[str, ...] = ()
-    channels: tuple[str, ...] = ()
-    dropped: tuple[str, ...] = ()
-    refused: Mapping[str, str] = field(default_factory=dict)
-    then: tuple[Step, ...] = ()
-
-    def step(self, before: State, candidates: Sequence[Candidate]) -> Step:
-        """The round's story; what follows another channel than its candidate did stands in its place, and a curve that
-        was none of the candidates behind them."""
-        kept = self.chosen
-        told = tuple(kept if kept and c.model.name == kept.model.name else c for c in candidates)
-        if kept and all(c is not kept for c in told):
-            told = (*told, kept)
-        return Step(before, told, kept, self.rivals, self.dropped, self.refused, channels=self.channels)
 
 
 def testable(x: Excitation, models: Sequence[Component]) -> list[Component]:
