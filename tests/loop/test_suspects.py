@@ -53,3 +53,13 @@ def test_what_moves_with_the_field_alone_is_no_event_of_a_sensor(of_a_sensor: bo
     chosen = looked_at(state, event("offset_while", time_s=600.0, until_s=900.0), once=True)
     assert OwnNoise(state.residual, None).p_value(chosen.terms) < 1e-6
     assert seen_alike_alone(chosen, state) is not of_a_sensor
+
+
+def test_of_one_sensor_nothing_but_the_total_field_tells() -> None:
+    rng = np.random.default_rng(6)
+    added = np.zeros((SAMPLES, 1, 3))
+    added[700:] = rng.normal(0.0, 1.0, 3)
+    state = linear_state(synthetic(6, SAMPLES, sensors=1, noise_nT=0.2, added=added))
+    chosen = looked_at(state, event("offset_step", time_s=700.0), once=True)
+    assert chosen.adjusted_own_p < 1e-6
+    assert not seen_alike_alone(chosen, state) and not within_the_noise_there(chosen, state)

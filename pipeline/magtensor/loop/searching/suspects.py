@@ -143,6 +143,8 @@ def seen_alike_alone(candidate: Candidate, state: State) -> bool:
     """Whether an event of the sensors is asked for by |b| - F alone: where all of what is left there is seen by all of
     them alike, the base station errs, or a field that it does not see moves."""
     residual = state.residual
+    if residual.across is None:  # of one sensor nothing else is seen
+        return False
     if not (happens_once(candidate.model) and candidate.model.component.effect == "instrument"):
         return False
     terms = candidate.model.terms(state.excitation).at(residual.samples)
@@ -170,7 +172,7 @@ def within_the_noise_there(candidate: Candidate, state: State) -> bool:
     beside = terms.series - known @ (known.T @ terms.series)
     rows, size, _ = np.linalg.svd(beside, full_matrices=False)
     tells = np.sum(rows[:, size > LEAST_SHOWN * size[0]] ** 2, axis=1)
-    louder = float(tells @ square) / float(tells @ (1.0 - tells)) / float(square.mean())
+    louder = float(tells @ square) / max(float(tells @ (1.0 - tells)) * float(square.mean()), 1e-300)
     if louder <= 1.0:
         return False
     return float(chdtrc(terms.count, chdtri(terms.count, p) / louder)) * _corrected(candidate) >= candidate.alpha
