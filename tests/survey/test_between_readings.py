@@ -86,3 +86,11 @@ def test_a_base_station_can_be_sent_to_another_process(how: Course, count: int) 
     asked = np.linspace(0.0, count - 1.0, 7)
     there = station.at(asked)
     np.testing.assert_array_equal(pickle.loads(pickle.dumps(station)).at(asked), there)
+
+
+def test_where_a_time_lies_between_readings() -> None:
+    """Before the first and after the last there is no share that has gone by."""
+    gap = Station(np.array([2.0, 4.0, 10.0]), np.zeros(3)).between(np.array([0.0, 2.0, 2.5, 4.0, 8.5, 10.0, 11.0]))
+    np.testing.assert_array_equal(gap.number, [0, 1, 1, 2, 2, 3, 3])
+    np.testing.assert_allclose(gap.share, [0.0, 0.0, 0.25, 0.0, 0.75, 1.0, 1.0])
+    np.testing.assert_array_equal(gap.apart_s, [2.0, 2.0, 2.0, 6.0, 6.0, 6.0, 6.0])

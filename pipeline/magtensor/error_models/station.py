@@ -14,6 +14,21 @@ from magtensor.calibration.types import Array
 
 
 @dataclass(frozen=True)
+class Between:
+    """Where times (N,) lie between a base station's readings.
+
+    Attributes:
+        number: (N,) how many readings there are until then.
+        share: (N,) of the time from the reading before to the one after that has gone by; 0 or 1 beyond the ends.
+        apart_s: (N,) from the one reading to the other; beyond the ends, of the two nearest.
+    """
+
+    number: NDArray[np.intp]
+    share: Array
+    apart_s: Array
+
+
+@dataclass(frozen=True)
 class Station:
     """Readings of the total field.
 
@@ -45,6 +60,13 @@ class Station:
         at an end of what was read its noise is hard to tell from its course."""
         begin, end = (self.time[1], self.time[-2]) if len(self.time) > 3 else (self.time[0], self.time[-1])
         return (time >= begin) & (time <= end)
+
+    def between(self, time: Array) -> Between:
+        """Where times (N,) s lie between the readings."""
+        number = np.searchsorted(self.time, time, side="right")
+        after = np.clip(number, 1, len(self.time) - 1)
+        apart = self.time[after] - self.time[after - 1]
+        return Between(number, np.clip((time - self.time[after - 1]) / apart, 0.0, 1.0), apart)
 
     def reach(self, time: Array) -> float:
         """The share of the times (N,) s between the first and the last reading."""

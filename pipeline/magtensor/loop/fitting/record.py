@@ -168,10 +168,8 @@ def _where_read(use: NDArray[np.bool_], time: Array, station: Station | None) ->
     few: what the field did there, in all sensors alike, would look like something that passed."""
     if station is None:
         return use
-    step = np.diff(station.time)
-    after = np.clip(np.searchsorted(station.time, time, side="right"), 1, len(step))
-    apart = step[after - 1] > FURTHER_APART * np.median(step)
-    between = apart & (time > station.time[after - 1]) & (time < station.time[after])
+    gap = station.between(time)
+    between = (gap.apart_s > FURTHER_APART * station.step_s) & (gap.share > 0.0) & (gap.share < 1.0)
     return use & ~between if between[use].sum() <= FEW * use.sum() else use
 
 

@@ -143,13 +143,9 @@ def _as_unread(away: Array, flagged: Mask, record: Record) -> bool:
     """Whether the field may have moved as far away (N,) nT in each run of flagged samples, which the base station did
     not read meanwhile."""
     assert record.station is not None
-    readings = record.station.time
-    for begin, end in in_a_row(flagged):
-        after = int(np.clip(np.searchsorted(readings, record.time[begin], side="right"), 1, len(readings) - 1))
-        span = float(readings[after] - readings[after - 1])
-        if not as_far_as_unread(float(away[begin:end].max()), span, record):
-            return False
-    return True
+    apart = record.station.between(record.time).apart_s
+    runs = in_a_row(flagged)
+    return all(as_far_as_unread(float(away[i:j].max()), float(apart[i]), record) for i, j in runs)
 
 
 def between_switches(flagged: Mask, state: State) -> str:

@@ -60,9 +60,8 @@ def sparse_readings(state: State, record: Record) -> SparseReadings | None:
     time = record.time[residual.samples]
     if station.step_s < EACH * float(np.median(np.diff(time))):
         return None
-    after = np.clip(np.searchsorted(station.time, time, side="right"), 1, len(station.time) - 1)
-    place = np.clip((time - station.time[after - 1]) / (station.time[after] - station.time[after - 1]), 0.0, 1.0)
-    between = 4.0 * place * (1.0 - place)
+    share = station.between(time).share
+    between = 4.0 * share * (1.0 - share)
     square = (residual.along / residual.reference_gain) ** 2
     growth = []
     for y, z in zip(np.array_split(square, blocks), np.array_split(between, blocks), strict=True):
@@ -91,8 +90,8 @@ def between_readings(some: Mask, record: Record) -> bool:
     """Whether each run of some samples (N,) lies between two readings of the base station."""
     assert record.station is not None
     edges = in_a_row(some)
-    before = np.searchsorted(record.station.time, record.time, side="right")
-    return bool((before[edges[:, 0]] == before[edges[:, 1] - 1]).all())
+    number = record.station.between(record.time).number
+    return bool((number[edges[:, 0]] == number[edges[:, 1] - 1]).all())
 
 
 def as_far_as_unread(amount_nT: float, span_s: float, record: Record) -> bool:

@@ -47,8 +47,8 @@ def between_readings(record: Record, state: State, place: int) -> bool:
     if np.sum(unseen**2) <= MOSTLY * np.sum(made**2):
         return False
     furthest = int(np.argmax(np.abs(unseen)))
-    after = int(np.clip(np.searchsorted(readings, time[furthest], side="right"), 1, len(readings) - 1))
-    return as_far_as_unread(float(np.abs(unseen[furthest])), float(readings[after] - readings[after - 1]), record)
+    apart_s = float(station.between(time).apart_s[furthest])
+    return as_far_as_unread(float(np.abs(unseen[furthest])), apart_s, record)
 
 
 def _gone_at_readings(made: Array, seen: Array, time: Array, station: Station) -> bool:
@@ -60,8 +60,7 @@ def _gone_at_readings(made: Array, seen: Array, time: Array, station: Station) -
     """
     if station.step_s < EACH * float(np.median(np.diff(time))):
         return False
-    after = np.clip(np.searchsorted(station.time, time, side="right"), 1, len(station.time) - 1)
-    place = (time - station.time[after - 1]) / (station.time[after] - station.time[after - 1])
-    near = np.abs(place - np.rint(place)) < NEAR
+    share = station.between(time).share
+    near = np.minimum(share, 1.0 - share) < NEAR
     known = float(made[near] @ made[near])
     return known > 0.0 and float(made[near] @ seen[near]) < MOSTLY * known
