@@ -37,3 +37,8 @@ BENDS = Field(description="values of the channel at which the response bends, st
 Bent = Annotated[tuple[float, ...], Bends(), BENDS]
 BentPower = Annotated[tuple[float, ...], Bends(instead=("power", "lower_powers")), BENDS]
 BentOrder = Annotated[tuple[float, ...], Bends(instead=("order",)), BENDS]
+BentOutput = Annotated[
+    tuple[float, ...],
+    Bends(),
+    Field(description="outputs of an axis, nT, at which its transfer curve bends besides; none: the power alone"),
+]

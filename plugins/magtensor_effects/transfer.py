@@ -7,10 +7,11 @@ from pydantic import Field
 
 from magtensor.calibration.types import Array
 from magtensor.components import error_model
+from magtensor.error_models.curves import along_a_curve
 from magtensor.error_models.excitation import Excitation
 from magtensor.error_models.settings import Orders, Range
 from magtensor.error_models.terms import Terms, joined
-from magtensor_effects.forms import OfField
+from magtensor_effects.forms import BentOutput, OfField
 
 FULL_SCALE_NT = 50000.0  # at which the coefficients of nonlinear terms are stated
 AT_FULL_SCALE = "nT at 50000 nT"
@@ -22,24 +23,33 @@ AT_FULL_SCALE = "nT at 50000 nT"
     typical="1 nT at 50 000 nT; CryoSat-2 3.2 nT with the cubic",
     pointwise=True,
 )
-def nonlinearity_quadratic(x: Excitation) -> Terms:
+def nonlinearity_quadratic(x: Excitation, *, bends: BentOutput = ()) -> Terms:
     """A second-order term in each axis's transfer curve: (m / 50 000 nT) squared.
 
     The coefficient is what it adds at 50 000 nT. Rival: `cross_field`, which nearly contains it where the total
-    field is constant; offset and scale themselves where an axis never changes sign.
+    field is constant; offset and scale themselves where an axis never changes sign. Where a curve with `bends` predicts
+    better, as of a gain that differs for either sign, each of these has a coefficient: what it adds 50 000 nT beyond.
     """
-    return x.responses((x.output / FULL_SCALE_NT) ** 2, AT_FULL_SCALE)
+    return _transfer_curve(x, x.output, 2, bends)
 
 
 @error_model("instrument", source="Olsen et al. 2020 (CryoSat-2)", typical="1 nT at 50 000 nT", pointwise=True)
-def nonlinearity_cubic(x: Excitation, *, of_field: OfField = False) -> Terms:
+def nonlinearity_cubic(x: Excitation, *, of_field: OfField = False, bends: BentOutput = ()) -> Terms:
     """A third-order term in each axis's transfer curve: (m / 50 000 nT) cubed.
 
     The coefficient is what it adds at 50 000 nT. In a constant total field F an answer m (F^2 - m^2) to the field
     across the axis is the same thing with the other sign but for a scale factor; no survey in the Earth's field
-    alone tells the two apart, and this name stands for both.
+    alone tells the two apart, and this name stands for both. `bends` as of `nonlinearity_quadratic`: an amplifier that
+    saturates.
     """
-    return x.responses((x.driving(of_field) / FULL_SCALE_NT) ** 3, AT_FULL_SCALE)
+    return _transfer_curve(x, x.driving(of_field), 3, bends)
+
+
+def _transfer_curve(x: Excitation, driving: Array, power: int, bends: tuple[float, ...]) -> Terms:
+    """A power of what drives each axis (N, S, 3) nT, and how far that is beyond each of the bends."""
+    beyond = along_a_curve(driving, bends)[1:]
+    smooth = x.responses((driving / FULL_SCALE_NT) ** power, AT_FULL_SCALE)
+    return joined([smooth, *(x.responses(c / FULL_SCALE_NT, AT_FULL_SCALE, label) for label, c in beyond)])
 
 
 @error_model(

@@ -21,16 +21,17 @@ def along_a_curve(course: Array, bends: Sequence[float]) -> list[tuple[str, Arra
 
 
 def bends_of(values: Array, pieces: int) -> tuple[float, ...]:
-    """Where a curve of a channel with the values (N,), in the order of time, may bend: evenly, so that it has so many
-    pieces, but only at values that the channel had at two times at least: nothing tells the law of a channel from
-    something that happened once where it was so only then. () where it has no such values."""
+    """Where a curve of a channel with the values (N,), in the order of time, or of any of K with (N, K), may bend:
+    evenly, so that it has so many pieces, but only at values that it had at two times at least: nothing tells the law
+    of a channel from something that happened once where it was so only then. () where it has no such values."""
     low, high = float(values.min()), float(values.max())
     edges = np.unique(np.linspace(0, len(values), PARTS + 1).astype(int))[:-1]
 
-    def known(bend: float) -> bool:
-        near = np.add.reduceat(np.abs(values - bend) <= ABOUT_A_BEND * (high - low), edges, dtype=int)
+    def known(bend: float, column: Array) -> bool:
+        near = np.add.reduceat(np.abs(column - bend) <= ABOUT_A_BEND * (high - low), edges, dtype=int)
         most = int((near + np.append(near[1:], 0)).max())
         return bool(near.sum() - most >= max(LEAST_AT_A_BEND, LEAST_SHARE * near.sum()))
 
+    columns = values.reshape(len(values), -1).T
     knots = np.linspace(low, high, pieces + 1)[1:-1]
-    return tuple(float(bend) for bend in knots if high > low and known(bend))
+    return tuple(float(bend) for bend in knots if high > low and any(known(bend, column) for column in columns))

@@ -38,17 +38,19 @@ def event_of_a_curve(state: State, terms: Terms, theta: Array, colours: Colours)
     """
     courses = [course for model in state.adopted for course in followed(model, state.excitation)]
     along = _Along.of(state, terms, theta, colours) if courses else None
+    return "" if along is None else next((name for name, values in courses if along.is_of_a_curve(values)), "")
+
+
+def event_of_an_axis(state: State, terms: Terms, theta: Array, colours: Colours) -> bool:
+    """Whether something that happened once is on one axis of a sensor, and any curve of what this reads explains most
+    of it, as above: it stayed where its transfer curve bends. Parameters as above."""
+    along = _Along.of(state, terms, theta, colours)
     if along is None:
-        return ""
-    alone = along.gain(along.waveform)
-    for name, values in courses:
-        gain, curve = along.best_curve(values)
-        if curve is None:
-            continue
-        beside = along.gain(np.column_stack([curve, along.waveform])) - gain
-        if gain > alone - SEPARATION or beside < HALF * alone:
-            return name
-    return ""
+        return False
+    square = (along.direction / state.residual.noise) ** 2
+    axis = int(np.argmax(square))
+    read = state.excitation.output.reshape(len(state.excitation.time), -1)[:, axis]
+    return bool(square[axis] > HALF * square.sum()) and along.is_of_a_curve(read)
 
 
 def another_curve(state: State, model: Adopted, terms: Terms, theta: Array, colours: Colours) -> str:
@@ -96,6 +98,15 @@ class _Along:
         given = np.arange(blocks.count) < blocks.count - series.shape[1]
         every = np.ones(blocks.count, dtype=bool)
         return float(interleaved_gain(blocks, self.white.residual.freedom, given, every).total)
+
+    def is_of_a_curve(self, values: Array) -> bool:
+        """Whether the best curve of some values explains as much, or leaves less than half of it."""
+        gain, curve = self.best_curve(values)
+        if curve is None:
+            return False
+        alone = self.gain(self.waveform)
+        beside = self.gain(np.column_stack([curve, self.waveform])) - gain
+        return gain > alone - SEPARATION or beside < HALF * alone
 
     def best_curve(self, values: Array) -> tuple[float, Array | None]:
         """What the best curve of a channel (N,) or (N, S) of all samples explains, and its series; of a constant -inf

@@ -65,7 +65,7 @@ class Loud:
             count = int(np.sum(~how.among(record.time)))
             told.append(
                 f"{count} samples in which most sensors are so loud have no part in the calibration, which is better "
-                "without them"
+                "without them, nor in the sensor noise"
             )
         return cls(told, stretches)
 

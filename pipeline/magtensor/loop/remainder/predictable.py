@@ -102,24 +102,28 @@ def attitude_square(state: State, left: Residual) -> float:
 def converter_words(state: State) -> list[str]:
     """Which outputs depart by an amount that follows from what they read, as those of a converter that is not linear
     do: steps and waves that no polynomial is."""
-    residual, x = state.residual, state.excitation
-    if residual.across is None:
+    amounts = by_what_they_read(state)
+    if not (amounts > 0).any():
         return []
-    found: dict[str, list[str]] = {}
-    amounts = []
-    for number, column in enumerate(residual.across.T):
-        sensor, axis = divmod(number, 3)
-        amount = _of_what_it_reads(x.output[residual.samples, sensor, axis], column)
-        if amount > 0:
-            found.setdefault(x.sensors[sensor], []).append(AXES[axis])
-            amounts.append(amount * residual.noise[number])
-    if not found:
-        return []
-    names = ", ".join(f"{sensor} ({' '.join(axes)})" for sensor, axes in found.items())
+    sensors = zip(state.excitation.sensors, amounts, strict=True)
+    each = [(name, " ".join(AXES[k] for k in np.flatnonzero(own))) for name, own in sensors]
+    names = ", ".join(f"{name} ({axes})" for name, axes in each if axes)
     return [
-        f"what {names} add follows from what they read, by {max(amounts):.2g} nT rms at most, predicted on held-out "
+        f"what {names} add follows from what they read, by {amounts.max():.2g} nT rms at most, predicted on held-out "
         "blocks, as a converter that is not linear would make it"
     ]
+
+
+def by_what_they_read(state: State) -> Array:
+    """By how much each axis of each sensor (S, 3) departs in a way that follows from what it reads, nT rms; 0 where
+    that predicts nothing on held-out blocks."""
+    residual, x = state.residual, state.excitation
+    amounts = np.zeros((len(x.sensors), 3))
+    for number, column in enumerate(() if residual.across is None else residual.across.T):
+        sensor, axis = divmod(number, 3)
+        reads = x.output[residual.samples, sensor, axis]
+        amounts[sensor, axis] = _of_what_it_reads(reads, column) * residual.noise[number]
+    return amounts
 
 
 def _of_what_it_reads(readings: Array, values: Array) -> float:

@@ -17,6 +17,7 @@ import numpy as np
 from magtensor.calibration.types import Array
 from magtensor.components import Component
 from magtensor.error_models.curves import bends_of
+from magtensor.error_models.excitation import Excitation
 from magtensor.error_models.settings import AnyChannel, Bends, Choice, profiled
 from magtensor.error_models.terms import Terms, joined
 from magtensor.golden import golden
@@ -37,6 +38,7 @@ from magtensor.loop.searching.gates import Candidate
 from magtensor.loop.searching.kin import explained_beside
 from magtensor.loop.searching.profiling import REFINING_SAMPLES, Thinned, already, thinned
 
+OUTPUTS = ""  # instead of a channel: what each axis reads
 FINEST = 48  # pieces of the curve between whose bends the few are chosen that the data ask for
 MOST_BENDS = 8
 SWEEPS = 2  # over all bends, once they are chosen
@@ -113,17 +115,19 @@ def by_any_law_of(channel: str, state: State, models: Sequence[Component], alpha
 
     Parameters
     ----------
-    models: all that are open.
+    channel: of `OUTPUTS` the models of each axis's transfer curve; models: all that are open.
     """
     x = state.excitation
-    channels = sum(not x.is_vector(name) for name in x.logged)
+    channels = 1 if channel == OUTPUTS else sum(not x.is_vector(name) for name in x.logged)
     found = []
     for component in models:
         grids = profiled(component)
-        places = [name for name, grid in grids.items() if isinstance(grid, AnyChannel) and channel in grid.values(x)]
-        if len(places) != 1 or not any(isinstance(grid, Bends) for grid in grids.values()):
+        any_ = {name: grid for name, grid in grids.items() if isinstance(grid, AnyChannel)}
+        places = [name for name, grid in any_.items() if channel in grid.values(x)]
+        own = channel == OUTPUTS and not any_
+        if not (own or len(places) == 1) or not any(isinstance(grid, Bends) for grid in grids.values()):
             continue
-        plain = {name: component.parameters[name].default for name in grids} | {places[0]: channel}
+        plain = {name: component.parameters[name].default for name in grids} | dict.fromkeys(places, channel)
         if already(state.adopted, component, plain):
             continue
         powers = {name for grid in grids.values() if isinstance(grid, Bends) for name in grid.instead}
@@ -159,12 +163,12 @@ def _by_a_curve(
     """
     x = state.excitation
     mark = next(((name, grid) for name, grid in profiled(model.component).items() if isinstance(grid, Bends)), None)
-    courses = followed(model, x)
-    if mark is None or len(courses) != 1:
+    column = _what_drives(model, x)
+    if mark is None or column is None:
         return None
     name, grid = mark
     line = {other: profiled(model.component)[other].options[0] for other in grid.instead}
-    column = np.atleast_2d(courses[0][1].T).mean(axis=0)[state.residual.samples]
+    column = column[state.residual.samples]
     has = tuple(model.settings.get(name, ()))
 
     def curve(bends: Sequence[float]) -> Adopted:
@@ -185,6 +189,15 @@ def _by_a_curve(
     moved = replace(moved, settings={**moved.settings, name: tuple(sorted(moved.settings[name]))})
     found = _assessed(state, moved, tried * comb(len(options), len(asked_for[chosen])), alpha).among(models)
     return found if found.passes else None
+
+
+def _what_drives(model: Adopted, x: Excitation) -> Array | None:
+    """What a model would follow by a curve: the channel (N,), or the axes' outputs (N, 3 S) nT where it needs none;
+    None where it follows more."""
+    if not model.channels(x):
+        return x.output.reshape(len(x.time), -1)
+    courses = followed(model, x)
+    return np.atleast_2d(courses[0][1].T).mean(axis=0) if len(courses) == 1 else None
 
 
 def _asked_for(

@@ -14,7 +14,7 @@ from magtensor.loop.fitting.separation import SEPARATION, fold_gain
 from magtensor.loop.fitting.trial import Trial, on_the_folds_of, trial
 from magtensor.loop.fitting.wandering import all_noise
 from magtensor.loop.remainder.changing_matrix import channel_instead
-from magtensor.loop.remainder.curve_of_a_channel import event_of_a_curve
+from magtensor.loop.remainder.curve_of_a_channel import event_of_a_curve, event_of_an_axis
 from magtensor.loop.searching.adopting import adopt, on_all_sensors, polished
 from magtensor.loop.searching.after_a_pause import left_by_a_pause
 from magtensor.loop.searching.beginnings import at_its_limit, began_with_a_vector
@@ -45,6 +45,7 @@ MAYBE_HEAT = (
     "the same"
 )
 LITTLE = 0.1  # of the error of a sensor: what a law leaves that is another one leaves more
+OF_AN_AXIS = "fitted, a curve of what one axis of a sensor reads explains most of it"
 UNEARNED = "fitted, it does not earn its place on held-out blocks"
 
 
@@ -177,6 +178,8 @@ def why_not(record: Record, before: Trial, after: Trial, chosen: Candidate, how:
             return f"it lies along the vectors of {name}, whose law may leave it"
         if channel := event_of_a_curve(seen, chosen.terms, theta, chosen.assessment.colours):
             return f"a curve of {channel} explains most of it: what is adopted may miss its law"
+        if event_of_an_axis(seen, chosen.terms, theta, chosen.assessment.colours):
+            return OF_AN_AXIS
         terms = chosen.terms.only(i for i, s in enumerate(chosen.terms.sensors) if s in acts_on)
         if channel := channel_instead(seen, terms, chosen.assessment.colours, min(moments(model))):
             return f"C of {', '.join(acts_on)} going with {channel} would explain more than something that happens once"

@@ -18,17 +18,19 @@ from magtensor.loop.fitting.model import Adopted, State
 from magtensor.loop.remainder.gradient_shape import MODEL as GRADIENT
 from magtensor.loop.remainder.gradient_shape import only_of_a_gradient
 from magtensor.loop.remainder.predictable import attitude_square
+from magtensor.loop.searching.any_law import by_a_curve
 from magtensor.loop.searching.contribution import a_tone
 from magtensor.loop.searching.gates import Candidate, seen_between
 from magtensor.loop.searching.kin import TIME, drivers
 
 SMALL = 1.0 / 9.0  # a third of the amplitude: what is found comes first, so nine more as large would have to be there
+MOST = 1.0  # of a curve of many pieces, which takes a part of any law of the attitude
 
 
 def part_of_a_larger_law(candidate: Candidate, state: State) -> str:
     """Why a candidate is not adopted that follows the attitude and leaves far more that does; "" where it does not."""
     before, terms = candidate.before or state, candidate.terms
-    if before.residual.across is None or terms.delay is not None or not _of_the_attitude(candidate.model, state):
+    if before.residual.across is None or terms.delay is not None or not follows_the_attitude(candidate.model, state):
         return ""
     residual, together = before.residual, terms if before.terms is None else joined([before.terms, terms])
     estimate = estimated(residual, together, candidate.assessment.colours)
@@ -38,7 +40,8 @@ def part_of_a_larger_law(candidate: Candidate, state: State) -> str:
     assert residual.across is not None and left.across is not None
     explained = float(np.sum(residual.across**2) - np.sum(left.across**2))
     stays = attitude_square(before, left)
-    if stays <= 0.0 or explained >= SMALL * stays:
+    least = MOST if by_a_curve(candidate.model) else SMALL
+    if stays <= 0.0 or explained >= least * stays:
         return ""
     ratio = np.sqrt(max(explained, 0.0) / stays)
     return f"it follows the attitude, and so does what it leaves, of which it is {ratio:.0%}"
@@ -68,7 +71,7 @@ def _differs_between_sensors(residual: Residual, terms: Terms, known: Array) -> 
     return seen_between(residual, terms, np.where(known > 0, signs / np.sqrt(np.maximum(known, 1e-300)), 0.0))
 
 
-def _of_the_attitude(model: Adopted, state: State) -> bool:
+def follows_the_attitude(model: Adopted, state: State) -> bool:
     """Whether a model of the sensors or the site has no course of its own but for the attitude: no channel, no time."""
     x = state.excitation
     of_its_own = any(name == TIME or not x.is_vector(name) for name in drivers(model, x))

@@ -12,8 +12,9 @@ from magtensor.error_models.needs import missing
 from magtensor.loop.fitting.model import CHANNEL, Fitting, Record, State
 from magtensor.loop.fitting.refit import settled
 from magtensor.loop.fitting.trial import Trial, on_the_folds_of, trial
+from magtensor.loop.remainder.predictable import by_what_they_read
 from magtensor.loop.remainder.tones import channels_of_the_line, tones
-from magtensor.loop.searching.any_law import by_a_curve, by_any_law, by_any_law_of, outdone_by
+from magtensor.loop.searching.any_law import OUTPUTS, by_a_curve, by_any_law, by_any_law_of, outdone_by
 from magtensor.loop.searching.beside_a_hole import of_a_hole
 from magtensor.loop.searching.contribution import eliminate, tones_of, without_models
 from magtensor.loop.searching.course_of_time import beside_time, responses_like, rivals_in_time
@@ -23,6 +24,7 @@ from magtensor.loop.searching.gates import Candidate
 from magtensor.loop.searching.keeping import (
     MAYBE_HEAT,
     NOT_AS_ASSUMED,
+    OF_AN_AXIS,
     ONE_OF_A_KIND,
     UNEARNED,
     Fitted,
@@ -30,7 +32,7 @@ from magtensor.loop.searching.keeping import (
     fitted_everywhere,
     why_not,
 )
-from magtensor.loop.searching.larger_law import part_of_a_gradient, part_of_a_larger_law
+from magtensor.loop.searching.larger_law import follows_the_attitude, part_of_a_gradient, part_of_a_larger_law
 from magtensor.loop.searching.latent import NAME, Sought, renewed, sought, source_instead, tried_source
 from magtensor.loop.searching.likeness import followed_by_a_curve, part_of_the_source
 from magtensor.loop.searching.on_fewer_sensors import on_those_needed
@@ -180,6 +182,8 @@ class Rounds:
                 continue
             shared = sought(state, record)
             kept = self.by_its_channel(record, standing, shared, how, open_)
+            if kept.standing is None and by_what_they_read(state).any():
+                kept = self.first_kept(record, standing, self.curves_of(OUTPUTS, state), how, open_, with_others=False)
             if kept.standing is not None:
                 steps.append(kept.step(state, [kept.chosen] if kept.chosen else []))
                 record, state = renewed(record, kept.standing.state, how)
@@ -245,6 +249,8 @@ class Rounds:
                 continue
             if why := self.of_another(chosen, before.state) or part_of_a_waveform(chosen, before.state, record):
                 refuse(chosen.model.name, why)
+                if follows_the_attitude(chosen.model, before.state):
+                    ask([OUTPUTS])
                 continue
             switched = switched_with(chosen.model, before.state)
             if ask(switched):
@@ -284,6 +290,8 @@ class Rounds:
                     return replace(two, rivals=rivals, channels=channels, refused=refused)
             if tried.after is None or tried.why:
                 refuse(chosen.model.name, tried.why)
+                if tried.why == OF_AN_AXIS:
+                    ask([OUTPUTS])
                 for c in candidates if tried.why == NOT_AS_ASSUMED else ():
                     if refused.get(c.model.name) == AS_LASTING.format(chosen.model.name):
                         del refused[c.model.name]
