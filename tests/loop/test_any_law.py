@@ -190,6 +190,10 @@ def test_bends_lie_where_the_survey_was_twice() -> None:
     bends = bends_of(once, 16)
     assert bends and max(bends) < 1.5  # beyond it is the first tenth, which no other saw
     assert all(bends_of(time, pieces) == () for pieces in (4, 16, 48))  # each value once
+    waves = (
+        0.03 * np.ptp(time) * np.sin(np.arange(len(time)) / 20.0)
+    )  # and, as a battery's voltage, once but for a little
+    assert all(bends_of(time + waves, pieces) == () for pieces in (4, 16, 48))
     assert bends_of(np.repeat([0.0, 1.0], 500), 8) == () and bends_of(np.ones(100), 8) == ()
     many = np.sin(60.0 * time)
     assert len(bends_of(many, 8)) == 7 and bends_of(many[:: int(2000 / LEAST_AT_A_BEND)], 8) == ()  # too few samples

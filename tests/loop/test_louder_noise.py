@@ -3,6 +3,7 @@ where it is much louder, and the quieter samples determine one."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from loop_cases import BASE, Array, adopted_names, linear_state, loaded, scenari
 from magtensor.loop.evidence.stretches import louder_in, too_loud_in
 from magtensor.loop.fitting.model import Fitting
 from magtensor.loop.fitting.refit import disturbed, joint_state, loud_stretches
+from magtensor.loop.remainder.loud import louder_words
 
 MODELS = ["offset_step", "passing_source", "eddy_current", "temperature_offset", "offset_drift", "scale_step"]
 
@@ -148,3 +150,16 @@ def test_events_within_the_noise_of_one_loud_sensor_are_not_told_of(seed: int, t
     assert not told["adopted"] and not told["unexplained"]["present"], told["unexplained"]["description"]
     assert told["unexplained"]["looks_like"] == []
     assert "the noise of S2 is" in told["unexplained"]["description"]
+
+
+@pytest.mark.parametrize(("times", "told"), [(4.0, True), (2.0, False)])
+def test_a_sensor_that_is_far_louder_than_the_others_is_told(times: float, told: bool) -> None:
+    added = np.zeros((1200, 4, 3))
+    added[:, 2] = np.sqrt(times**2 - 1.0) * np.random.default_rng(33).standard_normal((1200, 3))
+    words = louder_words(linear_state(synthetic(3, added=added)))
+    assert bool(words) is told
+    if told:
+        said = re.fullmatch(r"the noise of most sensors is ([\d.]+) nT an axis, that of S3 is ([\d.]+) nT", words[0])
+        assert (
+            said and float(said[1]) == pytest.approx(1.0, abs=0.05) and float(said[2]) == pytest.approx(4.0, rel=0.05)
+        )

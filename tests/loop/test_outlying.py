@@ -89,6 +89,18 @@ def test_what_all_sensors_have_now_and_then_is_no_single_ones() -> None:
     assert found.wrong.sum() > 50 and found.too_often() == []
 
 
+@pytest.mark.parametrize(("times", "told"), [(SIZE, True), (8.0, False)])
+def test_few_spikes_are_told_where_no_tail_of_noise_reaches(times: float, told: bool) -> None:
+    rng = np.random.default_rng(17)
+    added = np.zeros((1200, 4, 3))
+    added[100:1100:200, 1] = times * directions(rng, 5)
+    found, left_out = found_in(synthetic(18, 1200, added=added, turning_s=4.0))
+    assert left_out.sum() <= 0.01 * len(left_out)
+    words = spike_words(found, left_out)
+    assert bool(words) is told
+    assert not told or ("5 samples (0.4%)" in words[0] and "on S2" in words[0])
+
+
 def test_spikes_of_the_total_field_are_no_sensors() -> None:
     record = synthetic(10, 1200, turning_s=4.0)
     assert record.total_field is not None

@@ -14,10 +14,11 @@ import pytest
 from loop_cases import BASE, adopted_names, loaded, scenario, synthetic, verdict_of
 from scipy.signal import lfilter
 
+from magtensor.errors import DataError
 from magtensor.loop.fitting.model import Adopted, Fitting
 from magtensor.loop.fitting.refit import joint_state
 from magtensor.loop.searching import latent, overshadowed, rounds, search
-from magtensor.loop.searching.contribution import borne_out
+from magtensor.loop.searching.contribution import borne_out, possible_without, without_models
 from magtensor.loop.searching.found import Search
 from magtensor.loop.searching.overshadowed import attitude_share, of_what_is_left_out
 from magtensor.registry import Registry
@@ -180,7 +181,7 @@ def test_a_source_in_the_place_of_a_step_may_cost_samples_that_do_not_make_it_be
         )
 
     before, source = state(1000), SimpleNamespace(after=state(1000 - lost))
-    monkeypatch.setattr(latent, "without_models", lambda *_: state(1000))
+    monkeypatch.setattr(latent, "possible_without", lambda *_: state(1000))
     monkeypatch.setattr(latent, "sought", lambda *_, **__: object())
     monkeypatch.setattr(latent, "tried_source", lambda *_: (None, source))
     monkeypatch.setattr(latent, "per_sample", lambda s: better if s is source.after else 0.0)
@@ -206,7 +207,7 @@ def test_of_two_of_a_kind_one_may_have_taken_the_source_and_the_other_not(monkey
     def tried(_: Any, record: Any, of: Any, *__: Any) -> tuple[None, Any]:
         return None, SimpleNamespace(after=of) if [a.lag for a in of.adopted] != [] else None
 
-    monkeypatch.setattr(latent, "without_models", without)
+    monkeypatch.setattr(latent, "possible_without", without)
     monkeypatch.setattr(latent, "sought", lambda *_, **__: object())
     monkeypatch.setattr(latent, "tried_source", tried)
     monkeypatch.setattr(latent, "per_sample", lambda s: {(40.0,): 3.0, (-180.0,): 1.0}.get(_lags(s), 2.0))
@@ -272,3 +273,21 @@ def test_what_comes_and_goes_along_one_vector_is_one_source(phases: int, told: b
     assert [a.name for a in found.last.adopted] == ([] if told else ["offset_while"])
     whys = [why for step in found.steps for why in step.refused.values()]
     assert any("switches along one vector" in why for why in whys) is told
+
+
+def test_what_the_others_need_to_be_calibrated_stays() -> None:
+    """A current that makes as much of one sensor as the field does: without it that sensor sees another field."""
+    rng = np.random.default_rng(11)
+    current = rng.standard_normal(1200)
+    made = np.zeros(12)
+    made[3:6] = 20_000.0, -10_000.0, 14_000.0
+    added = current[:, None, None] * made.reshape(4, 3)
+    record = synthetic(12, added=added)
+    record = replace(record, logged={"pump": current}, units={"pump": "A"}, origins={"pump": 0.0})
+    model = Adopted(Registry.load().find("error_model", "channel_response"), {"channel": "pump", "power": 1})
+    state = joint_state(record, [model], Fitting(), [made])
+    with pytest.raises(DataError, match="does not see the field that the others see"):
+        without_models(record, state, [0], Fitting())
+    assert possible_without(record, state, [0], Fitting()) is None
+    kept, dropped = borne_out(record, state, Fitting(), 0)
+    assert kept is state and dropped == ()

@@ -11,7 +11,8 @@ from magtensor.calibration.types import Array
 ABOUT_A_BEND = 1 / 16  # of the channel's range to either side: where its values tell of a bend
 LEAST_AT_A_BEND = 20  # samples there, beside those of one time
 LEAST_SHARE = 0.2  # the same, of all samples there
-PARTS = 10  # of a survey, as many as there are held-out folds; two neighbouring ones are one time
+PARTS = 10  # of a survey, as many as there are held-out folds
+ONE_TIME = 3  # neighbouring ones: what falls evenly all the time is near a value in no more of them
 
 
 def along_a_curve(course: Array, bends: Sequence[float]) -> list[tuple[str, Array]]:
@@ -29,7 +30,7 @@ def bends_of(values: Array, pieces: int) -> tuple[float, ...]:
 
     def known(bend: float, column: Array) -> bool:
         near = np.add.reduceat(np.abs(column - bend) <= ABOUT_A_BEND * (high - low), edges, dtype=int)
-        most = int((near + np.append(near[1:], 0)).max())
+        most = int(np.convolve(near, np.ones(ONE_TIME, dtype=int)).max())
         return bool(near.sum() - most >= max(LEAST_AT_A_BEND, LEAST_SHARE * near.sum()))
 
     columns = values.reshape(len(values), -1).T

@@ -14,6 +14,7 @@ from magtensor.loop.fitting.model import Fitting, Record, State
 from magtensor.loop.fitting.refit import rounding, without
 
 LOUD = 2.0  # times the usual noise
+FAR_LOUDER = 3.0  # times the noise of the median sensor
 PARTS = 10  # of a survey, that are compared
 
 
@@ -88,6 +89,16 @@ def _stretch_words(longest: dict[str, tuple[float, float, float, int]], sensors:
         + (f", and in {others} shorter stretches" if others else "")
         for name, (begin, end, times, others) in each
     ]
+
+
+def louder_words(state: State) -> list[str]:
+    """Which sensors are far louder than most: what no model of a search would ever follow, a converter that lost a bit,
+    passes for the noise of its sensor."""
+    noise = np.sqrt(np.mean(state.residual.noise.reshape(-1, 3) ** 2, axis=1))
+    usual = float(np.median(noise))
+    each = zip(state.excitation.sensors, noise, strict=True)
+    louder = [f"that of {name} is {own:.3g} nT" for name, own in each if own > FAR_LOUDER * usual]
+    return [f"the noise of most sensors is {usual:.3g} nT an axis, {' and '.join(louder)}"] if louder else []
 
 
 def growing_words(name: str, steps: Array, elapsed: Array) -> list[str]:

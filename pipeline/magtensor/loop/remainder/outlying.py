@@ -19,6 +19,7 @@ from magtensor.loop.fitting.refit import everywhere
 from magtensor.loop.remainder.flagged import ALIKE, LONGEST_SPIKE, MANY_FLAGGED
 
 BEYOND = 5.0  # times the noise of a sensor
+FAR_OFF = 20.0  # times the noise of a sensor: no tail of its noise
 TIMES = 3.0  # times as many samples as of any other sensor
 MOSTLY = 0.7  # of the samples of the sensor that has most
 _SINGULAR = 1e-9  # of the largest eigenvalue
@@ -123,12 +124,13 @@ def outlying_words(found: Outlying, left_out: Mask) -> tuple[list[str], Mask]:
 
 
 def spike_words(found: Outlying, spikes: Mask) -> list[str]:
-    """How many samples are left out as spikes, by how much they are off, mostly on which sensors; nothing of few."""
-    count = int(spikes.sum())
-    if count <= MANY_FLAGGED * len(spikes):
+    """How many samples are left out as spikes, by how much they are off, mostly on which sensors; nothing of few that
+    the tails of noise may hold."""
+    worst, at = np.zeros(int(spikes.sum()), dtype=int), np.flatnonzero(spikes)
+    size, names, count = found.beside[at], found.names, len(at)
+    far = count > LONGEST_SPIKE and bool(names) and np.median(found.square[at].max(axis=1)) > FAR_OFF**2
+    if count <= MANY_FLAGGED * len(spikes) and not far:
         return []
-    worst, at = np.zeros(count, dtype=int), np.flatnonzero(spikes)
-    size, names = found.beside[at], found.names
     if names:
         worst = np.where(size > 0, len(names), found.square[at].argmax(axis=1))
         own = np.linalg.norm(found.off[at, np.minimum(worst, len(names) - 1)], axis=1)

@@ -13,6 +13,7 @@ from magtensor.calibration.types import Array
 from magtensor.error_models.settings import EventTimes, Frequencies, profiled
 from magtensor.error_models.terms import Terms
 from magtensor.error_models.waveform import NAME
+from magtensor.errors import DataError
 from magtensor.loop.evidence.assessment import WHITE, Colours
 from magtensor.loop.evidence.folds import Blocks
 from magtensor.loop.evidence.gains import Gain, concentrated, focused_gain, held_out_gain
@@ -173,8 +174,10 @@ def borne_out(record: Record, state: State, how: Fitting, fixed: int) -> tuple[S
         now = trial(record, state, how)
         rises = {}
         for place in range(fixed, len(state.adopted)):
-            without = trial(record, without_models(record, state, [place], how), how)
-            without = on_the_folds_of(now, record, without, how)
+            others = possible_without(record, state, [place], how)
+            if others is None:
+                continue
+            without = on_the_folds_of(now, record, trial(record, others, how), how)
             errors = without.beside(now)
             if errors[0]:
                 before, after = (float(np.sqrt(np.mean(np.square(list(e.values()))))) for e in errors)
@@ -311,3 +314,11 @@ def without_models(record: Record, state: State, places: Sequence[int], how: Fit
     """The fit without some of its models."""
     rest = [i for i in range(len(state.adopted)) if i not in places]
     return joint_state(record, [state.adopted[i] for i in rest], how, [state.theta[i] for i in rest], state.lines)
+
+
+def possible_without(record: Record, state: State, places: Sequence[int], how: Fitting) -> State | None:
+    """The same; None where what they explain is as large as the field, and the others leave nothing to calibrate."""
+    try:
+        return without_models(record, state, places, how)
+    except DataError:
+        return None

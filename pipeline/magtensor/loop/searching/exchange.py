@@ -19,7 +19,14 @@ from magtensor.loop.fitting.separation import fold_gain, separated
 from magtensor.loop.fitting.trial import Trial, on_the_folds_of, per_sample, trial
 from magtensor.loop.searching.adopting import polished
 from magtensor.loop.searching.beginnings import lags
-from magtensor.loop.searching.contribution import KEEP_ALPHA, happens_once, put_back_one, slices, without_models
+from magtensor.loop.searching.contribution import (
+    KEEP_ALPHA,
+    happens_once,
+    possible_without,
+    put_back_one,
+    slices,
+    without_models,
+)
 from magtensor.loop.searching.course_of_time import beside_time
 from magtensor.loop.searching.found import Step
 from magtensor.loop.searching.gates import Candidate
@@ -94,7 +101,9 @@ def exchanged(
     if found is None:
         return _without_a_course(record, state, steps, how, fixed)
     old = state.adopted[found.place].name
-    without = without_models(record, state, [found.place], how)
+    without = possible_without(record, state, [found.place], how)
+    if without is None:
+        return None
     chosen = looked_at_again(without, found.other, models)
     if chosen is None or (found.better and beside_time(chosen, without).refused):
         return None

@@ -41,7 +41,7 @@ from magtensor.loop.fitting.log_noise import brought_in
 from magtensor.loop.fitting.model import Adopted, Fitting, Record, State, generic
 from magtensor.loop.fitting.refit import joint_state
 from magtensor.loop.fitting.trial import per_sample
-from magtensor.loop.searching.contribution import happens_once, without_models
+from magtensor.loop.searching.contribution import happens_once, possible_without
 from magtensor.loop.searching.gates import OF_THE_LAW, Candidate, explained_before, explained_by, gained_of_a_log
 from magtensor.loop.searching.likeness import (
     FEW,
@@ -246,7 +246,9 @@ def source_instead(
     one_each = [[i] for i in places] if len(places) > 1 else []  # the other may be there
     found: list[Source] = []
     for gone in ([places] if places else []) + one_each:
-        less = without_models(record, state, gone, how)
+        less = possible_without(record, state, gone, how)
+        if less is None:
+            continue
         tried = left.significant and all(generic(state.adopted[i]) or happens_once(state.adopted[i]) for i in gone)
         shared = sought(less, record, may_follow=tried)
         source = None if shared is None else tried_source(component, record, less, shared, how, alpha)[1]

@@ -20,7 +20,7 @@ from magtensor.loop.fitting.model import Adopted, Fitting, Record, State
 from magtensor.loop.fitting.refit import joint_state
 from magtensor.loop.fitting.separation import fold_gain, separated
 from magtensor.loop.fitting.trial import Trial, on_the_folds_of, trial
-from magtensor.loop.searching.contribution import KEEP_ALPHA, happens_once, put_back_one, slices, without_models
+from magtensor.loop.searching.contribution import KEEP_ALPHA, happens_once, possible_without, put_back_one, slices
 from magtensor.loop.searching.on_fewer_sensors import narrowed, sensors_showing
 
 
@@ -58,8 +58,10 @@ def in_the_place_of_others(
         place, other = pair
         state = standing.state
         wide = _on(record, state, place, (*state.adopted[place].sensors, *state.adopted[other].sensors), how)
-        tried = trial(record, without_models(record, wide, [other], how), how)
         left.remove(place)  # each once
+        if (without := possible_without(record, wide, [other], how)) is None:
+            continue
+        tried = trial(record, without, how)
         if on_the_folds_of(tried, record, standing, how).hurt_by(tried):
             continue
         gone.append(state.adopted[other].name)

@@ -23,7 +23,7 @@ from magtensor.loop.fitting.refit import joint_state, loud_stretches, require_mo
 from magtensor.loop.fitting.trial import on_the_folds_of, trial
 from magtensor.loop.fitting.wandering import all_noise, narrowed_to, of_sensors, quieter, unweighed
 from magtensor.loop.remainder.flagged import lasting
-from magtensor.loop.searching.contribution import borne_out, eliminate, over_at_once, without_models
+from magtensor.loop.searching.contribution import borne_out, eliminate, over_at_once, possible_without
 from magtensor.loop.searching.found import Search, Step
 from magtensor.loop.searching.gates import ALPHA
 from magtensor.loop.searching.latent import NAME, renewed, sought
@@ -98,11 +98,13 @@ def search(
     while doubted := overshadowed(found, len(declared)):
         places, why = doubted
         name = found.last.adopted[places[0]].name
+        bare = replace(record, waveform=None) if name == NAME else record
+        rest = possible_without(bare, found.last, places, how)
+        if rest is None:
+            break
         if say is not None:
             say(f"taking {name} out again")
-        if name == NAME:
-            record = replace(record, waveform=None)
-        record, state = renewed(record, without_models(record, found.last, places, how), how)
+        record, state = renewed(bare, rest, how)
         state, steps = _weighed_once_more(record, state, steps, how, len(declared))
         state, dropped = borne_out(record, state, how, len(declared))
         candidates = rounds.candidates(state := with_lines(state, record, lines), record, how)

@@ -33,7 +33,7 @@ from magtensor.loop.remainder.flagged import (
 from magtensor.loop.remainder.gradient_shape import MODEL, gradient_share
 from magtensor.loop.remainder.jitter import jitter_words
 from magtensor.loop.remainder.limited_band import Band, limited_band
-from magtensor.loop.remainder.loud import Loud
+from magtensor.loop.remainder.loud import Loud, louder_words
 from magtensor.loop.remainder.outlying import Outlying, outlying_words, spike_words
 from magtensor.loop.remainder.predictable import attitude_words, converter_words, shortened_words
 from magtensor.loop.remainder.sparse_readings import SparseReadings, sparse_readings
@@ -77,7 +77,7 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
         )
     elif band is not None:
         excess = max(excess**2 + state.residual.scale**2 - band.rms_nT**2, 0.0) ** 0.5
-    beside = [*loud.words, *unread_words(state, record)]
+    beside = [*loud.words, *louder_words(state), *unread_words(state, record)]
     if excess < state.residual.scale and words == _left_by_a_law(found, record):
         words, beside = [], [*words, *beside]
     gradient = gradient_share(state, record.position)
