@@ -97,6 +97,7 @@ def tensor_error(folder: Path, found: xr.Dataset) -> tuple[float, float]:
     )
 
 
+@pytest.mark.long
 def test_a_survey_line_refines_the_rotation_that_was_left_free(files, capsys):
     calibration, refined = files / "plain" / "calibration.nc", files / "refined.nc"
     before, claimed = tensor_error(files, applied(files, calibration, "before"))

@@ -40,7 +40,7 @@ def put_back(b: Array) -> Array:
 @pytest.mark.parametrize(
     ("change", "sensors", "models"),
     [
-        (exchanged, ["S2", "S3"], STEPS),
+        pytest.param(exchanged, ["S2", "S3"], STEPS, marks=pytest.mark.long),
         pytest.param(put_back, ["S2"], STEPS, marks=pytest.mark.long),
         pytest.param(exchanged, ["S2", "S3"], None, marks=pytest.mark.long),
     ],

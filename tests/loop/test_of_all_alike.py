@@ -125,6 +125,7 @@ def test_channels_that_the_base_station_alone_does_not_see_are_named() -> None:
     assert set(channels_of_the_total_field(linear_state(beside), 1e-3)) == {"east", "north"}
 
 
+@pytest.mark.long
 def test_a_base_station_that_follows_the_temperature_is_no_fault_of_the_sensors(tmp_path: Path) -> None:
     def warmed(path: Path) -> None:
         with h5py.File(path, "a") as file:

@@ -98,6 +98,7 @@ def test_iron_that_all_sensors_have_alike_is_iron() -> None:
     assert not of_one_direction(state, 0)
 
 
+@pytest.mark.long
 def test_what_may_be_heat_is_not_blamed_on_a_logged_vector_that_goes_a_part_of_the_way(tmp_path: Path) -> None:
     """An accelerometer sees how the platform turns, and so a part of all that follows the attitude late."""
     one = np.outer([1.0, -0.6, 0.8], [0.7, 0.5, -0.5]).tolist()

@@ -27,6 +27,7 @@ def mode_of(time: Array) -> Array:
     return np.array(MODES)[np.searchsorted(edges, time)]
 
 
+@pytest.mark.long
 def test_an_offset_for_each_mode_is_traced_to_the_mode(tmp_path: Path) -> None:
     def switched(path: Path) -> None:
         with h5py.File(path, "a") as file:

@@ -379,7 +379,8 @@ def test_a_calibration_that_does_not_carry_over_is_told(unseen_nT: float, told: 
     assert ("the survey is too short to determine it" in sentence(outcome)) is told
 
 
-@pytest.mark.parametrize("noise_deg", [0.1, pytest.param(1.0, marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("noise_deg", [0.1, 1.0])
 def test_what_an_attitude_s_error_leaves_of_a_gradient_is_noted_and_not_unexplained(
     noise_deg: float, tmp_path: Path
 ) -> None:

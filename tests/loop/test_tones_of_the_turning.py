@@ -161,7 +161,8 @@ def test_channels_with_its_line_are_named_beside_a_tone(tmp_path: Path) -> None:
     assert adopted["indistinguishable_from"] == ["channel_response"] and adopted["channels_as_good"] == ["vibration"]
 
 
-@pytest.mark.parametrize("seed", [51, pytest.param(52, marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("seed", [51, 52])
 def test_a_tone_of_few_periods_is_found(seed: int, tmp_path: Path) -> None:
     """A thermostat that nobody logged, or mains that the sampling folds down, fourteen periods in all."""
     rng, frequency = np.random.default_rng(seed), 14.3 / 1200.0

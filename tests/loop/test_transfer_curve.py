@@ -42,7 +42,9 @@ def distorted(seed: int, law: Callable[[Array], Array], **survey: float) -> Reco
     "law",
     [
         pytest.param(lambda m: 5e-5 * np.maximum(m, 0.0), id="a gain that differs for either sign"),
-        pytest.param(lambda m: 0.5 * np.sin(2.0 * np.pi * m / 20_000.0), id="a converter's wave"),
+        pytest.param(
+            lambda m: 0.5 * np.sin(2.0 * np.pi * m / 20_000.0), id="a converter's wave", marks=pytest.mark.long
+        ),
         pytest.param(
             lambda m: -3.0 * np.sign(m) * (np.abs(m) / 50_000.0) ** 9, id="saturation", marks=pytest.mark.long
         ),

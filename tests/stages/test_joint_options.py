@@ -246,7 +246,7 @@ def test_offsets_for_another_survey_are_declared_and_told(tmp_path: Path) -> Non
     assert 20.0 < std["mean"] < 200.0
 
 
-@pytest.mark.parametrize("matrices", ["common", "linear"])
+@pytest.mark.parametrize("matrices", [pytest.param("common", marks=pytest.mark.long), "linear"])
 def test_offsets_of_this_survey_are_uncertain_in_another(tmp_path: Path, matrices: str) -> None:
     dates = ("2024-01-01", "2024-06-01", "2025-01-01", "2025-06-01")
     for k, date in enumerate(dates):
