@@ -13,6 +13,7 @@ from magtensor.calibration.joint import calibrated, fit_joint, nearest_frame
 from magtensor.calibration.nominal import Nominal, fit_nominal
 from magtensor.calibration.nominal_steps import NominalData
 from magtensor.calibration.types import Array
+from magtensor.calibration.undetermined import Undetermined
 from magtensor.errors import DataError, NotEnoughData
 from magtensor.loop.evidence.residual import residual_of
 
@@ -163,3 +164,17 @@ def test_a_variometer_far_from_its_base_line_is_fitted(seed: int) -> None:
     b = (raw - found.offset[0]) @ np.linalg.inv(found.forward[0]).T
     left = np.linalg.norm(b, axis=1) - total_field
     assert np.sqrt(np.mean(left**2)) < 0.3  # nT, no more than the drift; the base line is off by thousands
+
+
+@pytest.mark.parametrize(
+    ("combinations", "worst_nT", "enough"), [(0, 0.017, True), (0, 500.0, False), (3, 0.02, False)]
+)
+def test_a_prior_that_determines_nothing_is_no_lack_of_attitudes(
+    combinations: int, worst_nT: float, enough: bool
+) -> None:
+    """Samples that are flagged now had made the fit without it impossible."""
+    why = "sensor 2 does not see the field that the others see"
+    doubt = Undetermined(why, Nominal(), combinations, 45, worst_nT, 0.013, (), "")
+    assert doubt.facts()["determined"] is enough
+    assert ("the attitudes do not determine the calibration" in doubt.sentence) is not enough
+    assert (f"there was no fit ({why}), but the attitudes determine the calibration" in doubt.sentence) is enough

@@ -14,6 +14,7 @@ from .postures import sphere
 from .types import PARAMETERS_PER_SENSOR, Array
 
 BY_THE_PRIOR = 0.5  # of the prior's variance: a combination that keeps more is nominal rather than measured
+AS_WELL = 2.0  # times the error in the directions seen: no direction is worse where the attitudes are enough
 NAMED = 3  # parameters of a sensor, those that are known worst
 _GAUGE = 3
 
@@ -57,11 +58,24 @@ class Undetermined:
     further: str
 
     @property
+    def determined(self) -> bool:
+        """Whether the attitudes are enough all the same: what is flagged now had spoilt the fit without a prior."""
+        return not self.combinations and self.worst_error <= AS_WELL * self.seen_error
+
+    @property
     def sentence(self) -> str:
         """For the terminal and the report."""
+        known = (
+            f"|b| is known to {self.seen_error:.2g} nT in the directions seen, to {self.worst_error:.2g} nT in the "
+            "worst one"
+        )
+        if self.determined:
+            return (
+                f"without sensors that are taken near nominal ({self.nominal}) there was no fit ({self.why}), but the "
+                f"attitudes determine the calibration: {known}"
+            )
         said = (
-            f"the attitudes do not determine the calibration: sensors are taken near nominal ({self.nominal}); |b| is "
-            f"known to {self.seen_error:.2g} nT in the directions seen, to {self.worst_error:.2g} nT in the worst one"
+            f"the attitudes do not determine the calibration: sensors are taken near nominal ({self.nominal}); {known}"
         )
         if self.combinations:
             said += (
@@ -84,7 +98,7 @@ class Undetermined:
     def facts(self) -> dict[str, Any]:
         """For `verdict.json`."""
         return {
-            "determined": False,
+            "determined": self.determined,
             "description": self.sentence,
             "why": self.why,
             "assumed": {

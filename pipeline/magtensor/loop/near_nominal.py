@@ -107,7 +107,8 @@ def doubt_of(found: Search, how: Fitting, why: str) -> Undetermined | None:
 
 def labelled(calibration: ArrayCalibration, doubt: Undetermined) -> ArrayCalibration:
     """The calibration, saying of itself what is left open."""
-    facts: dict[str, float | str] = {"undetermined": doubt.sentence, "worst_error_nT": doubt.worst_error}
+    facts: dict[str, float | str] = {} if doubt.determined else {"undetermined": doubt.sentence}
+    facts["worst_error_nT"] = doubt.worst_error
     return replace(
         calibration,
         unobservable=(*calibration.unobservable, *doubt.words),
