@@ -242,12 +242,6 @@ def _refuse_faults(survey: Survey, magnitude: str, copied_axes: str, where: str)
             )
     if magnitude == "refuse":
         _refuse_magnitude(survey, where)
-    for s, a in checks.deaf_axes(field):
-        raise DataError(
-            f"axis {AXES[a]} is dead: it varies a hundred times less than any direction of the other sensors",
-            where=f"{where}: sensor {names[s]}",
-            hint="`load: {sensors: [...]}` can leave the sensor out",
-        )
     if copied_axes == "refuse":
         for s, a, other, b in checks.copies(field):
             raise DataError(
@@ -255,6 +249,12 @@ def _refuse_faults(survey: Survey, magnitude: str, copied_axes: str, where: str)
                 where=f"{where}: b_raw",
                 hint="is one column mapped twice? `load: {copied_axes: accept}` lets it pass",
             )
+    for s, a in checks.deaf_axes(field):
+        raise DataError(
+            f"axis {AXES[a]} is dead: it varies a hundred times less than any direction of the other sensors",
+            where=f"{where}: sensor {names[s]}",
+            hint="`load: {sensors: [...]}` can leave the sensor out",
+        )
 
 
 def _refuse_magnitude(survey: Survey, where: str) -> None:

@@ -12,6 +12,9 @@ from scipy.spatial.transform import Rotation
 
 from magtensor.applying import verification
 from magtensor.calibration.agreement import strangers, turns
+from magtensor.calibration.axes import flat_words
+from magtensor.calibration.joint import fit_joint
+from magtensor.errors import DataError
 from magtensor.preparing import empty_survey
 from magtensor.recipe.plan import read_plan
 from magtensor.runner import run
@@ -105,3 +108,16 @@ def test_apply_and_a_verification_tell_of_it(tmp_path: Path) -> None:
     with h5py.File(tmp_path / "2.h5", "r+") as file:
         file["b_raw"][:, 2] = Rotation.from_rotvec([0.0, 0.4, 0.3], degrees=True).apply(file["b_raw"][:, 2])
     assert verification(calibrated, tmp_path / "2.h5", planned)["turned_since"] == "S3 by 0.5 deg"
+
+
+def test_sensors_and_axes_that_are_exchanged_are_no_sensors() -> None:
+    """Of three sensors: then the axes of each are the same axis of all three, nearly one direction."""
+    rng = np.random.default_rng(12)
+    tilts = Rotation.from_rotvec(0.02 * rng.standard_normal((3, 3)))
+    field = F * Rotation.random(COUNT, random_state=rng).apply([0.0, 0.0, 1.0])
+    raw = np.stack([tilt.apply(field) for tilt in tilts], axis=1) + 0.2 * rng.standard_normal((COUNT, 3, 3))
+    fit_joint(raw, np.full(COUNT, F))
+    with pytest.raises(DataError, match=r"sensor 2 lie nearly in a plane.*\n.*are two of these exchanged"):
+        fit_joint(raw.transpose(0, 2, 1), np.full(COUNT, F))
+    # a fluxgate that is badly wrong is none of these
+    assert flat_words(np.array([np.eye(3), [[1.0, 0.3, 0.2], [0.3, 1.0, -0.3], [0.0, 0.2, 1.0]]])) == ()

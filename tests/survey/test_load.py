@@ -192,6 +192,14 @@ def test_dead_axes(load_variables: Load, variables: Variables) -> None:
         load_variables(changed(variables, "b_raw", set_to((slice(None), 2, 1), noise)))
 
 
+def test_an_axis_that_copies_another_is_not_called_dead(load_variables: Load, variables: Variables) -> None:
+    def copied(b: Any) -> None:
+        b[:, 2, 1] = b[:, 2, 0]
+
+    with pytest.raises(DataError, match="S3 x and S3 y hold the same numbers in every sample"):
+        load_variables(changed(variables, "b_raw", copied))
+
+
 def test_a_planar_rotation_is_no_dead_axis(load_variables: Load, variables: Variables) -> None:
     """All sensors share the direction that does not vary; that is the motion's fault, not a sensor's."""
     rng = np.random.default_rng(4)

@@ -14,6 +14,7 @@ import numpy as np
 
 from .types import Array
 
+FLATTEST = 0.1  # volume of three unit vectors; of right angles 1, of axes that are wrong by 30 degrees 0.7
 _NAMES = "xyz"
 
 
@@ -111,6 +112,20 @@ def mirrored_words(matrix: Array) -> tuple[str, ...]:
     maps = _against(matrix, reference)
     maps[hands == right] = np.eye(3)
     return axis_faults(maps, reference, [f"sensor {s + 1}" for s in range(len(matrix))])
+
+
+def flat_words(forward: Array) -> tuple[str, ...]:
+    """Words for every sensor whose three axes lie nearly in a plane, as no instrument's do.
+
+    Parameters
+    ----------
+    forward: (S, 3, 3) from one frame to the outputs, whose rows are the axes.
+    """
+    volume = np.abs(np.linalg.det(forward / np.linalg.norm(forward, axis=2, keepdims=True)))
+    return tuple(
+        f"the three axes of sensor {s + 1} lie nearly in a plane: they span {volume[s]:.2g} of what right angles would"
+        for s in np.flatnonzero(volume < FLATTEST)
+    )
 
 
 def turned_words(matrix: Array) -> tuple[str, ...]:

@@ -21,7 +21,7 @@ import numpy as np
 from magtensor.errors import DataError, NotEnoughData
 
 from .agreement import LARGEST_BEFORE_EFFECTS, LARGEST_DISAGREEMENT, require_agreement
-from .axes import mirrored_words, turned_words
+from .axes import flat_words, mirrored_words, turned_words
 from .blocks import Blocks, blocks_of
 from .by_sensor import by_sensor
 from .common_field import CommonField
@@ -201,14 +201,15 @@ def _level(part: Together, plane: CommonField, scalar: ScalarFit, keep: Mask) ->
 
 
 def refuse_sensors(forward: Array, offset: Array, raw: Array, total_field: Array, *, complete: bool = True) -> None:
-    """Mirrored sensors, and those that have nothing in common with the others, whose C is next to singular; what is not
-    complete may lack an effect by which a sensor differs so much."""
+    """Sensors that are mirrored, or flat, and those that have nothing in common with the others, whose C is next to
+    singular; what is not complete may lack an effect by which a sensor differs so much."""
     some = slice(None, None, max(1, len(raw) // 20_000))
     correction = np.asarray(np.linalg.pinv(forward, rcond=1e-9), dtype=np.float64)
     largest = LARGEST_DISAGREEMENT if complete else LARGEST_BEFORE_EFFECTS
     require_agreement(by_sensor(correction, raw[some] - offset), total_field[some], largest)
-    words = mirrored_words(correction)
-    if words:
+    if complete and (words := flat_words(forward)):
+        raise DataError("; ".join(words), hint="b_raw is samples, sensors, axes: are two of these exchanged?")
+    if words := mirrored_words(correction):
         raise DataError(
             "; ".join(words), hint="correct the sign or the order of the named axes when loading the survey"
         )
