@@ -128,7 +128,7 @@ def _in_words(mark: object) -> str:
             "False; True with the delays that what is left has most in common with, and once it is adopted, if better"
         )
     if isinstance(mark, Forms):
-        others = " or ".join(repr(o) for o in mark.options[1:])
+        others = " or ".join(repr(o) for o in mark.options[1:]) or "a curve"  # of `Bends`
         return f"{mark.options[0]!r}; {others} once it is adopted, if that is better"
     if isinstance(mark, Choice):
         return ", ".join(repr(o) for o in mark.options)
