@@ -3,12 +3,20 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
+import numpy as np
 import pytest
 from loop_cases import adopted_names, linear_state, loaded, scenario, verdict_of
 
 from magtensor.error_models.settings import Range
-from magtensor.loop.searching.unknown_rate import of_the_rate
+from magtensor.error_models.terms import Terms, joined
+from magtensor.loop.evidence.gains import Gain
+from magtensor.loop.fitting.model import Adopted, State
+from magtensor.loop.fitting.separation import separated
+from magtensor.loop.searching import unknown_rate
+from magtensor.loop.searching.unknown_rate import of_the_rate, rate_instead
 from magtensor.registry import Registry
 
 REMEMBERS = ["hysteresis", "viscous_magnetisation"]
@@ -77,3 +85,27 @@ def test_postures_show_a_time_constant_of_one_of_them(tmp_path: Path) -> None:
     resting = linear_state(loaded(tmp_path, scenario(4, motion=RESTS))).excitation
     assert not resting.turns
     assert Range(0.1, 100.0, sampled=True).least(resting) == resting.spacing == pytest.approx(13.0)
+
+
+@pytest.mark.parametrize(("beside", "refused"), [(44.0, False), (24.0, True), (5.0, True)])
+def test_a_memory_that_explains_more_beside_a_quicker_one_is_a_memory(
+    beside: float, refused: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of a play between postures what is quicker may be ahead by its coefficients, and yet not be all."""
+    state = linear_state(loaded(tmp_path, scenario(4, motion=RESTS)))
+    model = Registry.load().find("error_model", "hysteresis")
+    terms = model.function(state.excitation).at(state.residual.samples)
+    in_one_fold = np.where(np.arange(10) == 3, beside + 36.0, -4.0)
+
+    def fold_gain(state: State, colours: object, one: Terms, other: Terms | None = None) -> Gain:
+        gained = np.full(10, 61.0) if one is terms else np.full(10, 67.0)
+        return Gain(np.full(10, 1e3), 1e3 - gained - (0.0 if other is None else in_one_fold), np.full(10, 100.0))
+
+    monkeypatch.setattr(unknown_rate, "fold_gain", fold_gain)
+    chosen: Any = SimpleNamespace(
+        terms=terms, model=Adopted(model, {}), assessment=SimpleNamespace(colours=state.colours), before=None
+    )
+    models = [Registry.load().find("error_model", name) for name in [*REMEMBERS, *OF_THE_RATE]]
+    quicker = joined([terms])
+    assert not separated(fold_gain(state, None, quicker, terms), fold_gain(state, None, quicker))
+    assert ("something quicker would do" in rate_instead(chosen, state, models)) is refused

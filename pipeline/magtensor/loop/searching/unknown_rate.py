@@ -50,8 +50,6 @@ def rate_instead(chosen: Candidate, state: State, models: Sequence[Component]) -
     if not (lacking := of_the_rate(state.excitation, models)):
         return ""
     seen = chosen.before or state  # at the samples of its terms
-    if name := _quicker(chosen, seen, models):
-        return f"{name} with a time constant shorter than the samples show predicts as much: something quicker would do"
     colours = chosen.assessment.colours
     white = Whitened.of(seen.residual, colours.across, colours.along, seen.terms, over_time=False)
     own = explained(estimated_in(white, None)) if seen.terms is not None else 0.0
@@ -69,12 +67,15 @@ def rate_instead(chosen: Candidate, state: State, models: Sequence[Component]) -
             known = gain(terms)
             if known > alone and gain(joined([terms, chosen.terms])) - known < HALF * alone:
                 return f"{model.name}, for which the field turns too fast between samples, explains more"
+    if name := _quicker(chosen, seen, models):
+        return f"{name} with a time constant shorter than the samples show predicts as much: something quicker would do"
     return ""
 
 
 def _quicker(chosen: Candidate, state: State, models: Sequence[Component]) -> str:
     """The model whose time constant may not be shorter than the samples show, but with a shorter one is ahead of a
-    candidate, or of itself no worse, and leaves it nothing; "" if there is none."""
+    candidate, or of itself no worse, and leaves it nothing, or less than half of what that is behind by; "" if there
+    is none."""
     colours, x = chosen.assessment.colours, state.excitation
     for model in models:
         shorter = {n: QUICKER * g.least(x) for n, g in profiled(model).items() if isinstance(g, Range) and g.sampled}
@@ -88,6 +89,7 @@ def _quicker(chosen: Candidate, state: State, models: Sequence[Component]) -> st
         ahead = quick.over(own).total >= SEPARATION + spare  # in sum: a name has to stand in every fold, a doubt not
         if not (ahead or (same and not separated(own, quick))):
             continue
-        if not separated(fold_gain(state, colours, terms, chosen.terms), quick):
+        beside = fold_gain(state, colours, terms, chosen.terms).over(quick).total  # in sum, too
+        if beside < max(SEPARATION, HALF * quick.over(own).total):
             return model.name
     return ""
