@@ -96,7 +96,8 @@ def test_aligned_array(align) -> None:
     assert np.mean(contrasts) == pytest.approx(1.0, abs=0.12)
 
 
-@pytest.mark.parametrize("convention", [CHI, pytest.param(LI, marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("convention", [CHI, LI])
 def test_li_array(convention) -> None:
     """All twelve parameters of each sensor against the truth in the mean sensor's own frame."""
     rng = np.random.default_rng(4)

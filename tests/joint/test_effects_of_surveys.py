@@ -90,7 +90,8 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("case", [c if c == "surveys" else pytest.param(c, marks=pytest.mark.long) for c in CASES])
+@pytest.mark.long
+@pytest.mark.parametrize("case", CASES)
 def test_on_a_colder_survey(tmp_path: Path, case: str) -> None:
     """Thirty degrees away the effect is taken off, and the coefficients' errors are most of the tensor's."""
     survey, stages = CASES[case]

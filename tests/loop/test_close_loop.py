@@ -58,6 +58,7 @@ def test_the_packaged_recipe_is_the_one_of_the_contract() -> None:
     assert PACKAGED.read_bytes() == RECIPE.read_bytes()
 
 
+@pytest.mark.long
 def test_the_same_bits_as_the_recipe(tmp_path: Path, surveys: tuple[Path, Path]) -> None:
     survey, verify = surveys
     from_python = magtensor.close_loop(survey, verify=verify, search=SEARCH)

@@ -153,6 +153,7 @@ def test_an_effect_beyond_what_the_calibration_has_seen_is_told(
     assert error == pytest.approx(share * of_the_heater, rel=0.05) if told else error < 0.08 * of_the_heater
 
 
+@pytest.mark.long
 def test_a_verification_survey_in_other_units_does_not_gainsay_the_effect(folder: Path) -> None:
     def in_mA(file: h5py.File) -> None:
         file["current_heater"][...] = 1000.0 * file["current_heater"][()]

@@ -287,6 +287,7 @@ def recipe(tmp_path: Path, survey: Path) -> Path:
     return path
 
 
+@pytest.mark.long
 def test_a_session_that_is_piped_in(
     tmp_path: Path, recipe: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -44,7 +44,8 @@ def test_the_delay_is_found_and_the_lag_is_the_delay(
     assert not told["unexplained"]["present"], told["unexplained"]["description"]  # nor where no reading serves
 
 
-@pytest.mark.parametrize("delay_s", [12.0, pytest.param(-40.0, marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("delay_s", [12.0, -40.0])
 def test_nothing_is_adopted_for_what_happens_where_there_is_no_reading(tmp_path: Path, delay_s: float) -> None:
     """The station's record was cut by its own stamps to the time of the survey: of a delay nobody knows the field at
     one end of it."""
@@ -95,8 +96,9 @@ def test_spikes_of_the_base_station_are_left_out(tmp_path: Path) -> None:
     assert not told["adopted"] and not told["unexplained"]["present"], told["unexplained"]["description"]
 
 
-@pytest.mark.parametrize("time_s", [pytest.param(10.0, marks=pytest.mark.long), 60.0])
-@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("time_s", [10.0, 60.0])
+@pytest.mark.parametrize("seed", [1, 2])
 def test_noise_that_is_as_large_as_the_variation_is_no_excess_of_it(seed: int, time_s: float, tmp_path: Path) -> None:
     # half of what such a station records is not there at the site, sample by sample: a regression finds 50 %
     def noisy(path: Path) -> None:

@@ -135,7 +135,8 @@ def test_an_even_survey_has_no_loud_stretches() -> None:
     assert loud_stretches(record, linear_state(record), Fitting()) == ()
 
 
-@pytest.mark.parametrize("seed", [3, pytest.param(5, marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("seed", [3, 5])
 def test_events_within_the_noise_of_one_loud_sensor_are_not_told_of(seed: int, tmp_path: Path) -> None:
     def loud(path: Path) -> None:
         rng = np.random.default_rng(seed)

@@ -172,7 +172,8 @@ def test_nothing_is_spoiled_beside_a_gap(tmp_path: Path, effect: dict[str, Any],
     np.testing.assert_allclose(*known, rtol=1e-4)
 
 
-@pytest.mark.parametrize("silence", [pytest.param(np.nan, marks=pytest.mark.long), 0.0])
+@pytest.mark.long
+@pytest.mark.parametrize("silence", [np.nan, 0.0])
 def test_the_others_are_brought_back_to_their_time_meanwhile(tmp_path: Path, silence: float) -> None:
     whole, lost = applied_with_and_without(tmp_path, {"type": "sampling_lag", "rms_nT": 30.0}, silence)
     moved = np.abs(lost.values("calibrated/b") - whole.values("calibrated/b"))

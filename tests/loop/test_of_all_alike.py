@@ -56,7 +56,7 @@ def test_one_offset_of_all_sensors_turns_with_the_platform_if_that_turns(turning
 @pytest.mark.parametrize(
     "effect",
     [
-        {"type": "temperature_offset", "nT_per_degC": [0.3, 0.2, 0.1]},
+        pytest.param({"type": "temperature_offset", "nT_per_degC": [0.3, 0.2, 0.1]}, marks=pytest.mark.long),
         pytest.param({"type": "temperature_scale", "ppm_per_degC": [10.0, 16.0, 7.0]}, marks=pytest.mark.long),
         pytest.param(
             {"type": "current_field", "channel": "current_heater", "nT_per_A": [0.4, -0.3, 0.5]},

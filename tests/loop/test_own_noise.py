@@ -222,6 +222,7 @@ def read_rarely(seed: int, every: int, noise_nT: float) -> State:
     return linear_state(replace(record, total_field=read, station=station))
 
 
+@pytest.mark.long
 def test_readings_that_are_far_apart_are_no_more_than_they_are() -> None:
     """The noise of a base station that is read every thirty samples has fifty values, not 1500: what is drawn from one
     to the next is no evidence of its own."""

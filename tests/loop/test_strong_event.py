@@ -66,7 +66,7 @@ def beside_a_magnet(folder: Path, sensors: list[int], begin_s: float, end_s: flo
 @pytest.mark.parametrize(
     ("sensors", "end_s"),
     [
-        ([0], 400.0),
+        pytest.param([0], 400.0, marks=pytest.mark.long),
         pytest.param([0, 1, 2, 3], 400.0, marks=pytest.mark.long),
         pytest.param([0, 1, 2, 3], 700.0, marks=pytest.mark.long),
     ],

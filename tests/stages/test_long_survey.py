@@ -102,6 +102,7 @@ def test_a_run_in_windows_gives_what_the_whole_gives(folder: Path) -> None:
     assert not [p for p in (folder / "parts").iterdir() if p.name.startswith((".", "tmp"))]
 
 
+@pytest.mark.long
 def test_windows_of_which_one_holds_filled_in_rows(folder: Path, tmp_path: Path) -> None:
     """No calibration is fitted to them, in windows or on the whole."""
     survey = written(tmp_path / "c.h5", 4)
