@@ -32,6 +32,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -68,6 +69,38 @@ class Cone:
         return f"{self.half_angle_deg:.0f} deg around ({x:+.2f}, {y:+.2f}, {z:+.2f})"
 
 
+@dataclass(frozen=True, eq=False)
+class Attitudes:
+    """Where the samples of one sensor lie; what follows from it is found when it is asked for: a search fits thousands
+    of times and asks for hardly any of it.
+
+    Attributes:
+        directions: (M, 3) of the field in the sensor's axes, thinned out.
+        information: (9, 9), the sum of a a' over all samples, a the derivatives of `attitude_design`.
+        samples: how many those are.
+        held: how many a further posture would add.
+        chosen: the postures that would help most, where they have been chosen for all sensors together.
+    """
+
+    directions: Array
+    information: Array
+    samples: int
+    held: float
+    chosen: Further | None = None
+
+    @cached_property
+    def empty_cones(self) -> tuple[Cone, ...]:
+        return _empty_cones(self.directions)
+
+    @cached_property
+    def unseen(self) -> tuple[str, ...]:
+        return _unseen(self.directions)
+
+    @cached_property
+    def further(self) -> Further:
+        return self.chosen or further_postures(self.information, self.samples, self.held)
+
+
 @dataclass(frozen=True)
 class Coverage:
     """What the attitudes of one sensor's samples can determine.
@@ -81,10 +114,8 @@ class Coverage:
         worst_error: nT, predicted error of |b| in the worst direction of the sphere; infinite where it cannot be
             predicted, NaN where no fit was given.
         accepted_error: nT, what `worst_error` may reach.
-        empty_cones: the largest cones of directions without a sample, largest first.
-        unseen: half axes ("+x" ... "-z") that the field never came near.
         still: axes whose output never changed by more than 0.1 % of F.
-        further: the postures that would help most; none where the attitudes are spread well.
+        attitudes: where the samples lie.
         least_samples, least_attitudes: fewer are refused unseen.
     """
 
@@ -96,12 +127,25 @@ class Coverage:
     required_distance: float
     worst_error: float
     accepted_error: float
-    empty_cones: tuple[Cone, ...]
-    unseen: tuple[str, ...]
     still: tuple[str, ...]
-    further: Further
+    attitudes: Attitudes
     least_samples: int = LEAST_SAMPLES
     least_attitudes: int = LEAST_ATTITUDES
+
+    @property
+    def empty_cones(self) -> tuple[Cone, ...]:
+        """The largest cones of directions without a sample, largest first."""
+        return self.attitudes.empty_cones
+
+    @property
+    def unseen(self) -> tuple[str, ...]:
+        """Half axes ("+x" ... "-z") that the field never came near."""
+        return self.attitudes.unseen
+
+    @property
+    def further(self) -> Further:
+        """The postures that would help most; none where the attitudes are spread well."""
+        return self.attitudes.further
 
     @property
     def faults(self) -> tuple[str, ...]:
@@ -202,10 +246,8 @@ def coverage(
         required_distance=required_ratio(len(raw)) * level * field,
         worst_error=worst,
         accepted_error=worst_error * field,
-        empty_cones=_empty_cones(thinned),
-        unseen=_unseen(thinned),
         still=tuple(a for a, spread in zip("xyz", np.ptp(points, axis=0), strict=True) if spread < SAME_ATTITUDE),
-        further=further_postures(attitude.T @ attitude, len(raw), _held(directions)),
+        attitudes=Attitudes(thinned, attitude.T @ attitude, len(raw), _held(directions)),
     )
 
 
@@ -237,7 +279,10 @@ def same_postures(found: Sequence[Coverage], unit: Sequence[Array], turn: Array)
     together = further_together(
         np.array([a.T @ a for a in designs]), turn, [len(a) for a in designs], [_held(u) for u in unit]
     )
-    return [replace(own, further=further) for own, further in zip(found, together, strict=True)]
+    return [
+        replace(own, attitudes=replace(own.attitudes, chosen=further))
+        for own, further in zip(found, together, strict=True)
+    ]
 
 
 def coverage_alone(raw: Array, total_field: Array) -> tuple[Coverage, Array]:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 
@@ -59,13 +60,16 @@ def attitude_design(unit: Array) -> Array:
     return np.column_stack([x * x, y * y, z * z, 2 * y * z, 2 * x * z, 2 * x * y, x, y, z])
 
 
+@cache
 def sphere(count: int = 2000) -> Array:
-    """Directions (count, 3) spread evenly over the sphere (golden spiral): gaps below 5 deg."""
+    """Directions (count, 3) spread evenly over the sphere (golden spiral): gaps below 5 deg. Not to be written to."""
     k = np.arange(count) + 0.5
     z = 1 - 2 * k / count
     turn = np.pi * (1 + np.sqrt(5.0)) * k
     r = np.sqrt(1 - z**2)
-    return np.column_stack([r * np.cos(turn), r * np.sin(turn), z])
+    directions = np.column_stack([r * np.cos(turn), r * np.sin(turn), z])
+    directions.flags.writeable = False
+    return directions
 
 
 def further_postures(information: Array, samples: float, each: float = 1.0) -> Further:

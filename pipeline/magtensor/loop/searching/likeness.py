@@ -94,9 +94,10 @@ def _shortest_first(most: int) -> NDArray[np.int_]:
 
 def _correlations(late: Array, early: Array, shifts: NDArray[np.int_]) -> Array:
     """Of two series (n,), the first moved back by each of some shifts, where both are; 0 where one is constant."""
-    from scipy.signal import correlate
+    from scipy.fft import irfft, next_fast_len, rfft
 
     n = len(late)
+    padded = next_fast_len(2 * n - 1, real=True)
     late, early = late - late.mean(), early - early.mean()
     a, b = np.maximum(shifts, 0), np.maximum(-shifts, 0)
 
@@ -107,7 +108,8 @@ def _correlations(late: Array, early: Array, shifts: NDArray[np.int_]) -> Array:
 
     of_late, of_early = sums(late, a, n - b), sums(early, b, n - a)
     overlap = n - np.abs(shifts)
-    both = correlate(late, early, method="fft")[shifts + n - 1] - of_late * of_early / overlap
+    products = irfft(rfft(late, padded) * rfft(early, padded).conj(), padded)
+    both = products[shifts] - of_late * of_early / overlap
     late_power = sums(late**2, a, n - b) - of_late**2 / overlap
     early_power = sums(early**2, b, n - a) - of_early**2 / overlap
     moves = (late_power > LEAST_POWER * late.dot(late)) & (early_power > LEAST_POWER * early.dot(early))

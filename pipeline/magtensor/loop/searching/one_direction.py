@@ -22,6 +22,7 @@ VISCOUS = "viscous_magnetisation"
 CHANCE = 0.01  # probability that noise alone makes the other directions explain as much
 A_FIFTH = 0.2  # of what matrices without any order would leave beside one direction
 _ROUNDS = 50
+_STILL = 1e-8  # a unit vector that moves no farther
 _DRAWS = 30
 
 
@@ -50,24 +51,26 @@ def beside_one_direction(matrices: Array, information: Array) -> float:
     ----------
     information: (9 S, 9 S) on their entries.
     """
-    sensors, theta = len(matrices), matrices.ravel()
+    rows, theta = 3 * len(matrices), matrices.ravel()
+    by_entry = information.reshape(rows, 3, rows, 3)
+    shown = (information @ theta).reshape(rows, 3)
     found = []
     w: Array
     for w in np.linalg.svd(matrices.reshape(-1, 3))[2]:
         for _ in range(_ROUNDS):
-            k = _least(np.kron(np.eye(3 * sensors), w[:, None]), theta, information)
-            w = _least(np.kron(k[:, None], np.eye(3)), theta, information)
+            k = _solved(w @ (by_entry @ w), shown @ w)
+            before, w = w, _solved(k @ np.tensordot(k, by_entry, (0, 0)), k @ shown)
             w = np.asarray(w / max(float(np.linalg.norm(w)), 1e-300), dtype=float)
-        made = np.kron(np.eye(3 * sensors), w[:, None])
-        left = theta - made @ _least(made, theta, information)
+            if np.abs(w - before).max() < _STILL:
+                break
+        left = theta - np.outer(_solved(w @ (by_entry @ w), shown @ w), w).ravel()
         found.append(float(left @ information @ left))
     return min(found)
 
 
-def _least(columns: NDArray[np.floating[Any]], theta: Array, information: Array) -> Array:
-    """Coefficients of columns (9 S, K) that come nearest to theta (9 S,)."""
-    seen = columns.T @ information
-    return np.asarray(np.linalg.lstsq(seen @ columns, seen @ theta, rcond=1e-9)[0])
+def _solved(normal: Array, shown: NDArray[np.floating[Any]]) -> Array:
+    """The least of the solutions where the normal matrix leaves more than one."""
+    return np.asarray(np.linalg.lstsq(normal, shown, rcond=1e-9)[0])
 
 
 def left_by_chance(matrices: Array, information: Array) -> float:
