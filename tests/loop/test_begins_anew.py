@@ -98,7 +98,7 @@ def test_what_stays_does_not_begin_anew(tmp_path: Path, found: Found, effect: di
     assert "begins_anew" not in done.calibration.apply(bare)["calibrated/b"].attrs
 
 
-@pytest.mark.parametrize("effect", [STEP, RETUNED], ids=lambda e: str(e["type"]))
+@pytest.mark.parametrize("effect", [STEP, pytest.param(RETUNED, marks=pytest.mark.long)], ids=lambda e: str(e["type"]))
 @pytest.mark.parametrize(("at", "when"), [([0.1], "happened before"), ([], "not yet"), ([250.0], "")])
 def test_outputs_come_before_the_dates(
     tmp_path: Path, found: Found, effect: dict[str, Any], at: list[float], when: str

@@ -33,6 +33,7 @@ def cubic(sensors: tuple[str, ...] = ()) -> Adopted:
     return Adopted(component, {"of_field": False}, sensors)
 
 
+@pytest.mark.long
 def test_only_the_sensor_that_is_bent_is_named(tmp_path: Path) -> None:
     told = verdict_of(tmp_path, scenario(91), another_range, models=CURVES)
     assert told["adopted"]

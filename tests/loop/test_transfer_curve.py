@@ -79,26 +79,35 @@ def test_a_power_stays_one(power: int) -> None:
     assert model.name in CURVES and not model.settings["bends"]
 
 
-def test_what_lasts_while_an_axis_reads_next_to_nothing_is_no_event() -> None:
-    """A platform that turns slowly, and a dead zone of one axis, in which it stays for a while each time; beside it
-    something that did happen, on that axis alone."""
+def held_reading(of_an_axis: bool) -> Record:
+    """A platform that turns slowly, and a dead zone of one axis, in which it stays for a while each time; or something
+    that did happen, on that axis alone."""
     record = synthetic(4, SAMPLES, turning_s=30.0)
-    reads = record.raw[:, 0, 0]
-    dead = np.where(np.abs(reads) < 6000.0, -4.5 * reads / 6000.0, 4.5 * np.sign(reads) * (np.abs(reads) < 12000.0))
-    event = np.zeros(SAMPLES)
-    event[900:960] = 8.0
-    for added, of_an_axis in ((dead, True), (event, False)):
-        raw = record.raw.copy()
-        raw[:, 0, 0] += added
-        state = linear_state(replace(record, raw=raw))
-        one = by_hand.candidate(Registry.load().find("error_model", "offset_while"), {}, state, 30, ALPHA)
-        theta = one.assessment.theta[-one.terms.count :]
-        assert event_of_an_axis(state, one.terms, theta, one.assessment.colours) is of_an_axis
-        result = found(replace(record, raw=raw))
-        (adopted,) = result.last.adopted
-        assert adopted.sensors == ("S1",)
-        assert adopted.name in CURVES if of_an_axis else adopted.name == "offset_while"
-        assert (result.steps[0].refused.get("offset_while") == OF_AN_AXIS) is of_an_axis
+    raw, reads = record.raw.copy(), record.raw[:, 0, 0]
+    if of_an_axis:
+        dead = np.abs(reads) < 6000.0
+        raw[:, 0, 0] += np.where(dead, -4.5 * reads / 6000.0, 4.5 * np.sign(reads) * (np.abs(reads) < 12000.0))
+    else:
+        raw[900:960, 0, 0] += 8.0
+    return replace(record, raw=raw)
+
+
+@pytest.mark.parametrize("of_an_axis", [True, False])
+def test_what_lasts_while_an_axis_reads_next_to_nothing_is_no_event(of_an_axis: bool) -> None:
+    state = linear_state(held_reading(of_an_axis))
+    one = by_hand.candidate(Registry.load().find("error_model", "offset_while"), {}, state, 30, ALPHA)
+    theta = one.assessment.theta[-one.terms.count :]
+    assert event_of_an_axis(state, one.terms, theta, one.assessment.colours) is of_an_axis
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("of_an_axis", [True, False])
+def test_it_is_a_curve_of_that_axis(of_an_axis: bool) -> None:
+    result = found(held_reading(of_an_axis))
+    (adopted,) = result.last.adopted
+    assert adopted.sensors == ("S1",)
+    assert adopted.name in CURVES if of_an_axis else adopted.name == "offset_while"
+    assert (result.steps[0].refused.get("offset_while") == OF_AN_AXIS) is of_an_axis
 
 
 def test_a_bend_is_where_any_of_the_axes_was_twice() -> None:
