@@ -67,6 +67,7 @@ def close_loop(
     not determine the calibration (level flight), what is known of sensors beforehand stands in, and the result says so.
     """
     from magtensor.calibration.joint import calibrated
+    from magtensor.calibration.known import facts_of, known_to
     from magtensor.calibration.nominal import Nominal
     from magtensor.effect_errors import coefficient_variables, with_coefficients
     from magtensor.loop.correcting.correction import as_elsewhere
@@ -123,16 +124,16 @@ def close_loop(
     if last.adopted and last.fit.posterior is None:
         together = with_coefficients(last)
         calibration, errors = together.calibration, coefficient_variables(together, survey.sensors)
-    doubt = doubt_of(found, how, refused)
+    known = known_to(calibration, last.excitation.field[last.fit.keep, 0])
+    doubt = doubt_of(found, how, known, refused)
     if doubt is not None:
         calibration = labelled(calibration, doubt)
-    outcome = {
+    outcome: dict[str, Any] = {
         "declared": ["linear", *(a.name for a in begin)],
         "noise_floor_nT": noise_floor(found.told.residual, all_noise=not left["present"]),
     } | inquiry.told(found)
     outcome |= {"unexplained": left, "held_out": {"before": before, "after": after}}
-    if doubt is not None:
-        outcome["calibration"] = doubt.facts()
+    outcome["calibration"] = doubt.facts() if doubt else facts_of(known, outcome["noise_floor_nT"])
     undisturbed = np.array(survey.readings)
     undisturbed[record.samples[~last.fit.keep]] = False
     clean = cleaned(survey, calibration, last.adopted, last.theta, record.origins, undisturbed)

@@ -10,6 +10,7 @@ from level_cases import TOTAL, flight
 
 from magtensor.calibration import nominal as nominal_module
 from magtensor.calibration.joint import calibrated, fit_joint, nearest_frame
+from magtensor.calibration.known import Known
 from magtensor.calibration.nominal import Nominal, fit_nominal
 from magtensor.calibration.nominal_steps import NominalData
 from magtensor.calibration.types import Array
@@ -174,7 +175,7 @@ def test_a_prior_that_determines_nothing_is_no_lack_of_attitudes(
 ) -> None:
     """Samples that are flagged now had made the fit without it impossible."""
     why = "sensor 2 does not see the field that the others see"
-    doubt = Undetermined(why, Nominal(), combinations, 45, worst_nT, 0.013, (), "")
+    doubt = Undetermined(why, Nominal(), combinations, 45, Known(0.013, worst_nT), (), "")
     assert doubt.facts()["determined"] is enough
     assert ("the attitudes do not determine the calibration" in doubt.sentence) is not enough
     assert (f"there was no fit ({why}), but the attitudes determine the calibration" in doubt.sentence) is enough

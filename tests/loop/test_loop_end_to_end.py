@@ -208,6 +208,10 @@ def test_limited_tilt(tmp_path: Path, effect: dict[str, Any] | None) -> None:
     require_contract(found)
     if effect is None:
         assert found["adopted"] == [] and not found["unexplained"]["present"]
+        # what lies upside down was never seen
+        known = found["calibration"]["total_field_std_nT"]
+        assert known["flown"] < 0.2 * NOISE_NT < NOISE_NT < known["worst_direction"]
+        assert found["calibration"]["determined"] and "in the worst one" in found["calibration"]["description"]
     else:
         assert "temperature_offset" in suspects(found)
 

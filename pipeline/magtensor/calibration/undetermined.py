@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from .joint import JointFit, Posterior, nearest_frame
+from .joint import JointFit, Posterior
+from .known import Known
 from .nominal import Nominal
-from .postures import sphere
 from .types import PARAMETERS_PER_SENSOR, Array
 
 BY_THE_PRIOR = 0.5  # of the prior's variance: a combination that keeps more is nominal rather than measured
@@ -42,8 +42,7 @@ class Undetermined:
         nominal: the prior.
         combinations, of: how many combinations of the parameters the prior determines rather than the data, and how
             many there are.
-        worst_error: nT, standard deviation of |b| in the worst direction of the sphere; seen_error: the same, rms over
-            the directions of the survey.
+        total_field: what |b| is known to.
         parameters: all of them, sensor after sensor.
         further: the postures that would help most.
     """
@@ -52,23 +51,19 @@ class Undetermined:
     nominal: Nominal
     combinations: int
     of: int
-    worst_error: float
-    seen_error: float
+    total_field: Known
     parameters: tuple[Parameter, ...]
     further: str
 
     @property
     def determined(self) -> bool:
         """Whether the attitudes are enough all the same: what is flagged now had spoilt the fit without a prior."""
-        return not self.combinations and self.worst_error <= AS_WELL * self.seen_error
+        return not self.combinations and self.total_field.worst <= AS_WELL * self.total_field.seen
 
     @property
     def sentence(self) -> str:
         """For the terminal and the report."""
-        known = (
-            f"|b| is known to {self.seen_error:.2g} nT in the directions seen, to {self.worst_error:.2g} nT in the "
-            "worst one"
-        )
+        known = self.total_field.words
         if self.determined:
             return (
                 f"without sensors that are taken near nominal ({self.nominal}) there was no fit ({self.why}), but the "
@@ -108,7 +103,7 @@ class Undetermined:
             },
             "combinations_by_prior": self.combinations,
             "combinations": self.of,
-            "total_field_std_nT": {"flown": self.seen_error, "worst_direction": self.worst_error},
+            "total_field_std_nT": self.total_field.facts(),
             "parameters": [
                 {"sensor": p.sensor, "name": p.name, "std": p.std, "assumed_std": p.assumed_std, "units": p.units}
                 for p in self.parameters
@@ -117,12 +112,12 @@ class Undetermined:
         }
 
 
-def undetermined(fit: JointFit, nominal: Nominal, sensors: Sequence[str], field: Array, why: str) -> Undetermined:
+def undetermined(fit: JointFit, nominal: Nominal, sensors: Sequence[str], total_field: Known, why: str) -> Undetermined:
     """What a fit with a prior leaves open.
 
     Parameters
     ----------
-    field: (N, 3) nT, the common field of the survey in the frame of `nearest_frame`.
+    total_field: what |b| is known to.
     why: the refusal of the fit without a prior.
     """
     known = fit.posterior
@@ -139,29 +134,9 @@ def undetermined(fit: JointFit, nominal: Nominal, sensors: Sequence[str], field:
         for s, sensor in enumerate(sensors)
         for k, (name, unit) in enumerate(zip(names, units, strict=True))
     )
-    some = field[:: max(1, len(field) // 2000)]
-    length = float(np.mean(np.linalg.norm(some, axis=1)))
-    worst = float(np.max(_error(fit, known, sphere() * length)))
-    seen = float(np.sqrt(np.mean(_error(fit, known, some) ** 2)))
     share = _shares(known)
     further = str(fit.coverage.further)
-    return Undetermined(
-        why, nominal, int(np.sum(share > BY_THE_PRIOR)), len(share), worst, seen, parameters, further
-    )  # fmt: skip
-
-
-def _error(fit: JointFit, known: Posterior, field: Array) -> Array:
-    """(N, S) nT, standard deviation of |b| of each sensor in fields (N, 3) nT."""
-    correction = np.linalg.inv(fit.forward @ nearest_frame(fit.forward))
-    unit = field / np.linalg.norm(field, axis=1, keepdims=True)
-    out = np.empty((len(field), len(correction)))
-    size = PARAMETERS_PER_SENSOR
-    for s, matrix in enumerate(correction):
-        response = unit @ matrix
-        columns = np.hstack([(response[:, :, None] * field[:, None, :]).reshape(len(field), 9), response])
-        own = known.covariance[size * s : size * (s + 1), size * s : size * (s + 1)]
-        out[:, s] = np.sqrt(np.maximum(np.einsum("ni,ij,nj->n", columns, own, columns), 0.0))
-    return out
+    return Undetermined(why, nominal, int(np.sum(share > BY_THE_PRIOR)), len(share), total_field, parameters, further)
 
 
 def _shares(known: Posterior) -> Array:

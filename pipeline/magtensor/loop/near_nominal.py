@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
+from magtensor.calibration.known import Known
 from magtensor.calibration.nominal import Nominal
 from magtensor.calibration.types import ArrayCalibration
 from magtensor.calibration.undetermined import Undetermined, undetermined
@@ -97,18 +98,17 @@ def _refused(first: DataError, second: DataError) -> DataError:
     return type(first)(first.what, where=first.where or second.where, hint=hint)
 
 
-def doubt_of(found: Search, how: Fitting, why: str) -> Undetermined | None:
+def doubt_of(found: Search, how: Fitting, known: Known, why: str) -> Undetermined | None:
     """What a calibration leaves open; None where its attitudes determine it."""
     if how.nominal is None:
         return None
-    fit = found.last.fit
-    return undetermined(fit, how.nominal, found.record.sensors, found.last.excitation.field[fit.keep, 0], why)
+    return undetermined(found.last.fit, how.nominal, found.record.sensors, known, why)
 
 
 def labelled(calibration: ArrayCalibration, doubt: Undetermined) -> ArrayCalibration:
     """The calibration, saying of itself what is left open."""
     facts: dict[str, float | str] = {} if doubt.determined else {"undetermined": doubt.sentence}
-    facts["worst_error_nT"] = doubt.worst_error
+    facts["worst_error_nT"] = doubt.total_field.worst
     return replace(
         calibration,
         unobservable=(*calibration.unobservable, *doubt.words),
