@@ -262,6 +262,19 @@ def test_a_step_along_whose_vector_more_is_left_out_is_a_part_of_that(along: boo
         assert doubted[0] == [0] and "299 samples" in doubted[1]
 
 
+def test_a_step_that_is_undone_at_other_times_is_a_part_of_what_switches() -> None:
+    """On for a while before the step, off for a while after it, all of that left out: as large either way round."""
+    vector = np.random.default_rng(4).standard_normal((4, 3))
+    record = synthetic(14, added=4.0 * (np.arange(1200) > 700)[:, None, None] * vector)
+    found = search.search(record, [Registry.load().find("error_model", "offset_step")], Fitting())
+    share = np.zeros(1200)
+    share[300:340], share[900:940] = 1.0, -1.0
+    raw = record.raw + 4.0 * share[:, None, None] * vector
+    last = replace(found.last, fit=replace(found.last.fit, keep=found.last.fit.keep & (share == 0.0)))
+    doubted = of_what_is_left_out(replace(found, record=replace(record, raw=raw), last=last, evenly=None), 0)
+    assert doubted is not None and doubted[0] == [0] and "and is as large" in doubted[1]
+
+
 @pytest.mark.parametrize(("phases", "told"), [(1, False), pytest.param(3, True, marks=pytest.mark.long)])
 def test_what_comes_and_goes_along_one_vector_is_one_source(phases: int, told: bool) -> None:
     """Though offsets for a while explain all of it: one of them may be a tool that lay there, three are a source."""

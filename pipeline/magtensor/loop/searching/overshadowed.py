@@ -175,8 +175,8 @@ def of_what_is_left_out(found: Search, fixed: int) -> tuple[list[int], str] | No
 
 
 def _as_large(share: Array, samples: NDArray[np.int_], state: State, place: int) -> bool:
-    """Whether samples are off by an event once more, or by it the other way round, at another time: not at those beside
-    its own, where it may not have come or gone at once.
+    """Whether most samples are off by an event once more, or by it the other way round, at another time: not at those
+    beside its own, where it may not have come or gone at once.
 
     Parameters
     ----------
@@ -187,7 +187,7 @@ def _as_large(share: Array, samples: NDArray[np.int_], state: State, place: int)
     elsewhere = (np.abs(samples[:, None] - at) > ABOUT).all(axis=1)
     if np.count_nonzero(elsewhere) <= ABOUT:
         return False
-    return abs(abs(float(np.mean(share[elsewhere]))) - 1.0) < AS_MUCH
+    return abs(float(np.median(np.abs(share[elsewhere]))) - 1.0) < AS_MUCH
 
 
 def _of_one_that_switches(state: State, fixed: int) -> tuple[list[int], str] | None:
