@@ -57,8 +57,9 @@ def test_the_band_is_told_by_the_highest_frequencies(sensors: int) -> None:
         assert band is None or band.slow > 5.0
 
 
-def test_what_one_sensor_has_alone_is_no_noise_of_a_band() -> None:
-    """As of a sensor that comes late to a field that turns: no faster than that."""
+@pytest.mark.parametrize("noise_nT", [0.01, 0.2])
+def test_what_one_sensor_has_alone_is_no_noise_of_a_band(noise_nT: float) -> None:
+    """As of a sensor that comes late to a field that turns: no faster than that. What the others are told by has it."""
     one = np.zeros((SAMPLES, 4, 3))
     one[:, 1] = behind_a_filter(np.random.default_rng(6), (SAMPLES, 3), 0.15)
-    assert limited_band(linear_state(synthetic(6, SAMPLES, 4, 0.01, one)).residual) is None
+    assert limited_band(linear_state(synthetic(6, SAMPLES, 4, noise_nT, one)).residual) is None

@@ -7,12 +7,14 @@ from itertools import pairwise
 
 import numpy as np
 
+from magtensor.calibration.types import Array
 from magtensor.loop.evidence.colour import mean_power
 from magtensor.loop.evidence.residual import Residual
 
 OCTAVES = 4  # below the highest frequency, in which a filter may begin: what is slower than that moves
 FALLS = 10.0  # times the power of the highest octave: 1/f^2 noise over white has less from one octave to the next
 UNLIKE = 10.0  # times the power of another output: noise of sensors of one kind has less, an effect on some has more
+TOLD_APART = 3  # sensors
 LEAST = 512  # samples
 
 
@@ -39,8 +41,8 @@ def limited_band(residual: Residual) -> Band | None:
     if left is None:
         assert residual.along is not None
         left, one = residual.along[:, None], np.ones(1)
-    count, each = len(left), np.mean(left**2, axis=0) / one
-    if count < LEAST or each.max() > UNLIKE * each.min():
+    count = len(left)
+    if count < LEAST or _unlike(residual, np.mean(left**2, axis=0) / one):
         return None
     power = mean_power(left)
     edges = [0, *(count >> k for k in range(OCTAVES, -1, -1))]
@@ -52,3 +54,14 @@ def limited_band(residual: Residual) -> Band | None:
     part = float(parts[0] + np.minimum(levels[1:] / level, 1.0) @ parts[1:])
     slow = max(levels[0] / level - 1.0, 0.0) * parts[0] / part
     return Band(residual.scale * float(np.sqrt(level * part / one.mean())), part, float(np.sqrt(slow)))
+
+
+def _unlike(residual: Residual, each: Array) -> bool:
+    """Whether some outputs have far more than others, of mean squares (n,) over those of their white noise: what one
+    has is in the differences to all others, by which two sensors do not tell whose it is."""
+    sensors = residual.projector.shape[0] // 3
+    if residual.across is not None and sensors >= TOLD_APART:
+        from scipy.optimize import nnls
+
+        each = nnls(residual.projector**2, each * np.diagonal(residual.projector))[0]
+    return bool(each.max() > UNLIKE * each.min())
