@@ -55,7 +55,7 @@ def _drawn(variance: Array, target: Array | float, freedom: float) -> Array:
     """Variances, each known from so many independent values, drawn to a target as far as they scatter by chance about
     it: the weight of positive-part empirical Bayes (Efron and Morris 1973)."""
     chance = 2.0 / freedom
-    beyond = max(float(np.mean((variance / target - 1.0) ** 2)) - chance, 0.0)
+    beyond = max(float(np.mean((variance / np.maximum(target, np.finfo(float).tiny) - 1.0) ** 2)) - chance, 0.0)
     out: Array = target + beyond / (beyond + chance) * (variance - target)
     return out
 

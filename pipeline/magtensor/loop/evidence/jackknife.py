@@ -71,7 +71,11 @@ class Jackknife:
         p = basis.shape[1]
         if p == 0 or p >= count:
             return 1.0
-        basis = _confirmed(basis @ np.linalg.inv(np.linalg.cholesky(basis.T @ full_n[0] @ basis)).T, n)
+        try:
+            root = np.linalg.cholesky(basis.T @ full_n[0] @ basis)
+        except np.linalg.LinAlgError:
+            return 1.0  # beside the others these tell nothing but rounding: the field never moved
+        basis = _confirmed(basis @ np.linalg.inv(root).T, n)
         p = basis.shape[1]
         if p == 0:
             return 1.0  # single blocks hold nearly all there is to know: nothing can confirm it

@@ -16,6 +16,7 @@ import numpy as np
 from magtensor.calibration.types import Array
 from magtensor.loop.evidence.colour import Colour
 
+ROUNDING = 1e-10  # of the largest eigenvalue of a matrix
 LEAST_EXCESS = 1.0  # over the white power: a mode with less is left to the stationary part
 MOST_MODES = 100
 MOST_ENTRIES = 1e7
@@ -143,7 +144,13 @@ class TurnedColour:
     def _root(self) -> tuple[Array, Array]:
         """sqrt(variance) (M,), and the lower Cholesky factor (M, M) of one plus the modes' power over the white."""
         size = np.sqrt(self.variance)
-        return size, np.linalg.cholesky(np.eye(len(size)) + self.modes.gram * np.outer(size, size))
+        power = self.modes.gram * np.outer(size, size)
+        try:
+            return size, np.linalg.cholesky(np.eye(len(size)) + power)
+        except np.linalg.LinAlgError:  # next to noiseless: rounding of the largest is more than the white level
+            values, vectors = np.linalg.eigh(power)
+            values = 1.0 + np.maximum(values, ROUNDING * values[-1])
+            return size, np.linalg.cholesky((vectors * values) @ vectors.T)
 
     def log_volume(self, count: int) -> float:
         """As `Colour.log_volume`."""
