@@ -88,7 +88,7 @@ def test_it_is_named_and_the_calibration_is_as_good_as_without(
     else:
         assert error["before"] is None  # no calibration without it brings the sensors to one field
     assert error["after"]["total_field_rms_nT"]["all"] < 0.2  # 0.15 nT of noise an axis, 0.1 nT of the base station's
-    assert "calibration" not in found.verdict  # it is determined
+    assert found.verdict["calibration"]["determined"]
     assert not found.verdict["unexplained"]["present"]
 
 
