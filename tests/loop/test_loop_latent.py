@@ -18,8 +18,9 @@ from magtensor.loop.evidence.factor import noise_alone, with_factor
 from magtensor.loop.evidence.shared_waveform import ALPHA, strongest
 from magtensor.loop.fitting.model import Adopted, Fitting, Record
 from magtensor.loop.fitting.refit import joint_state
+from magtensor.loop.fitting.wandering import narrowed_to, of_sensors
 from magtensor.loop.searching import latent
-from magtensor.loop.searching.latent import shared_words, sought, tried_source
+from magtensor.loop.searching.latent import of_every_sensor, shared_words, sought, tried_source
 from magtensor.registry import Registry
 from magtensor.tensor.geometry import array_design, standard_geometry
 
@@ -207,6 +208,26 @@ def test_a_source_is_found_with_its_waveform_and_vectors() -> None:
     # 12 values along the field and 9 across from 1600 samples of unit noise: some 0.06 nT
     np.testing.assert_allclose(theta, 3.0 * VECTORS * WAVE.std(), atol=0.25)
     left = sought(source.after, source.record)
+    assert left is not None and not left.significant
+
+
+def test_a_source_that_some_sensors_show_by_themselves_acts_on_all() -> None:
+    """Found among three, of which the fourth has been wandering; then fitted on all of them."""
+    whole, names = with_source(), ("S1", "S2", "S4")
+    some = of_sensors(whole, names)
+    shared = sought(state := linear_state(some), some)
+    assert shared is not None
+    source = tried_source(MODEL, some, state, shared, Fitting(), 0.005)[1]
+    assert source is not None and source.record.waveform is not None
+    found = narrowed_to(source.after.adopted, source.after.theta, source.after, names)
+    model, theta = of_every_sensor(found[0][0], found[1][0], linear_state(whole))
+    assert model.sensors == () and len(model.settings["noise_nT"]) == len(theta) == 12
+    np.testing.assert_array_equal(theta.reshape(4, 3)[2], 0.0)
+    record = replace(whole, waveform=source.record.waveform)
+    after = joint_state(record, [model], Fitting(), [theta])
+    vectors = after.theta[0].reshape(4, 3) * np.sign(source.record.waveform @ WAVE)
+    np.testing.assert_allclose(vectors, 3.0 * VECTORS * WAVE.std(), atol=0.25)
+    left = sought(after, record)
     assert left is not None and not left.significant
 
 

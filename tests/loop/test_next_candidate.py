@@ -149,7 +149,6 @@ def test_what_another_width_of_an_adopted_law_explains_is_no_other_effect(
     monkeypatch.setattr(rounds, "by_a_worse_log", lambda *_: set())
     monkeypatch.setattr(rounds, "part_of_a_larger_law", lambda *_: "")
     monkeypatch.setattr(rounds, "part_of_a_gradient", lambda *_: "")
-    monkeypatch.setattr(rounds, "of_the_field_itself", lambda *_: "")
     monkeypatch.setattr(rounds, "part_of_a_drift", lambda *_: None)
     monkeypatch.setattr(rounds, "beside_time", lambda *_: BesideTime(True))
     monkeypatch.setattr(rounds, "part_of", lambda *_: False)
@@ -189,7 +188,6 @@ def test_of_one_name_the_curve_of_another_channel_is_still_tried(monkeypatch: py
         "switched_with": lambda *_: (),
         "part_of_a_larger_law": lambda *_: "",
         "part_of_a_gradient": lambda *_: "",
-        "of_the_field_itself": lambda *_: "",
         "part_of_a_drift": lambda *_: None,
         "rate_instead": lambda *_: "",
         "hindered_by_another": lambda *_: None,

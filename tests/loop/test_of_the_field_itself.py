@@ -11,11 +11,12 @@ from loop_cases import Array, synthetic
 from magtensor.loop.fitting.model import Fitting, Record
 from magtensor.loop.searching.found import Search
 from magtensor.loop.searching.search import search
+from magtensor.loop.searching.unexplained import unexplained
 from magtensor.registry import Registry
 
 SAMPLES = 1200
 CONSTANT = 50_000.0
-MODELS = ("scale_drift", "temperature_scale", "reference_drift", "offset_drift")
+MODELS = ("scale_drift", "scale_step", "temperature_scale", "reference_drift", "offset_drift")
 TIME = np.arange(SAMPLES) / SAMPLES
 
 
@@ -38,12 +39,15 @@ def found(record: Record) -> Search:
     return search(record, [registry.find("error_model", name) for name in MODELS], Fitting())
 
 
-@pytest.mark.parametrize("nT", [5.0, 30.0])
-def test_a_field_that_changes_is_no_scale_of_the_sensors(nT: float) -> None:
-    result = found(without_station(1, CONSTANT + nT * TIME))
+@pytest.mark.parametrize("course", [TIME, 1.0 * (TIME > 0.6)], ids=["it drifts", "it jumps, for the array was moved"])
+@pytest.mark.parametrize("nT", [5.0, 300.0])
+def test_a_field_that_changes_is_no_scale_of_the_sensors(nT: float, course: Array) -> None:
+    result = found(without_station(1, CONSTANT + nT * course))
     assert result.last.adopted == ()
-    refused = {name: why for step in result.steps for name, why in step.refused.items()}
-    assert refused and all("the reference is a constant" in why for why in refused.values())
+    refused = [why for step in result.steps for why in step.refused.values()]
+    assert any("the field, of which only a constant is known, would look the same" in why for why in refused)
+    told = unexplained(result, result.record)
+    assert told["present"] and "mostly in |b| - F, alike in all sensors" in told["description"]
 
 
 def test_a_scale_factor_of_one_sensor_is_found_beside_a_constant() -> None:

@@ -123,7 +123,7 @@ def _compared(model: Adopted, theta: Array, before: State) -> _Compared | None:
     apart = [made.at(residual.samples) for made in _of_time(model, x, name)]
     courses = joined(apart)
     alike = courses if name == THE_FIELD else _of_its_pattern(apart, theta, x)
-    station = joined([x.on_reference(course, "nT", "") for course in smooth_courses(x)[residual.samples].T])
+    station = joined([x.on_reference(course, "nT", "") for course in _courses(x)[residual.samples].T])
     every = joined([*held, own, courses])
     left = taken_off(residual, every, estimated(residual, every, WHITE).theta)
     colours = colours_of(left, stiff=True, above=FIRST_LEFT)
@@ -141,8 +141,8 @@ def _compared(model: Adopted, theta: Array, before: State) -> _Compared | None:
         channel - own.count,
         time - courses.count,
         explains(residual, own) - (explains(residual) if held else 0.0),
-        chance_of(channel, own.count) < SEEN,
-        chance_of(time, courses.count) < MORE and chance_of(pattern, alike.count) < SEEN,
+        _chance(channel, own.count) < SEEN,
+        _chance(time, courses.count) < MORE and _chance(pattern, alike.count) < SEEN,
     )
 
 
@@ -183,7 +183,7 @@ def _with_slopes(model: Adopted, theta: Array, x: Excitation) -> Terms:
     return joined([here, *slopes])
 
 
-def smooth_courses(x: Excitation) -> Array:
+def _courses(x: Excitation) -> Array:
     """(N, K) smooth courses of time."""
     part = (x.time - x.time[0]) / max(x.duration, 1e-300)
     return np.asarray(np.polynomial.legendre.legvander(2.0 * np.sqrt(part) - 1.0, COURSES)[:, 1:])
@@ -191,7 +191,7 @@ def smooth_courses(x: Excitation) -> Array:
 
 def _of_time(model: Adopted, x: Excitation, name: str) -> list[Terms]:
     """What a model makes of each smooth course of time in the place of its channel; of the field, offsets."""
-    courses = smooth_courses(x)
+    courses = _courses(x)
     if name == THE_FIELD:
         return [x.offsets(course, "nT") for course in courses.T]
     settings = _plain(model)
@@ -225,7 +225,7 @@ def _plain(model: Adopted) -> Mapping[str, Any]:
     return found
 
 
-def chance_of(explained: float, coefficients: int) -> float:
+def _chance(explained: float, coefficients: int) -> float:
     """Probability that so many coefficients explain as much of noise of unit variance."""
     from scipy.special import chdtrc
 

@@ -30,7 +30,7 @@ from magtensor.loop.searching.contribution import (
 from magtensor.loop.searching.course_of_time import outweighed
 from magtensor.loop.searching.gates import Candidate
 from magtensor.loop.searching.left_out import better_left_out, between_its_flanks
-from magtensor.loop.searching.like_a_station import as_a_station_would
+from magtensor.loop.searching.like_a_station import as_a_station_would, only_a_constant
 from magtensor.loop.searching.likeness import event_along
 from magtensor.loop.searching.on_fewer_sensors import narrowed
 from magtensor.loop.searching.one_direction import VISCOUS, of_one_direction
@@ -137,7 +137,12 @@ def why_not(record: Record, before: Trial, after: Trial, chosen: Candidate, how:
     if not two_channels and already(same, model.component, model.settings):
         return ONE_OF_A_KIND
     slow, channels = hardly_begun(chosen.model, x), sorted(model.channels(x))
-    if (slow or channels or a_tone(model)) and as_a_station_would(after.state, which):
+    field = only_a_constant(x)
+    if (field or slow or channels or a_tone(model)) and as_a_station_would(after.state, which):
+        if field:
+            return (
+                "fitted, all sensors show it alike: the field, of which only a constant is known, would look the same"
+            )
         drift = "drifts" if slow else f"follows {' and '.join(channels)}" if channels else "has its period"
         return f"fitted, all sensors show it alike: an error of the base station that {drift} would look the same"
     if hardly_begun(model, x) and ((not slow and chosen.moved is None) or began_with_a_vector(model)):

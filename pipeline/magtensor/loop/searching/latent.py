@@ -259,6 +259,17 @@ def source_instead(
     return max(found, key=lambda source: per_sample(source.after), default=None)
 
 
+def of_every_sensor(model: Adopted, theta: Array, state: State) -> tuple[Adopted, Array]:
+    """A source that was found among some sensors, and its coefficients, of all sensors of a state: of the others
+    nothing yet, and their noise is that of the state."""
+    among = [state.excitation.sensors.index(s) for s in model.sensors]
+    vectors, noise = np.zeros((len(state.excitation.sensors), 3)), state.residual.noise.reshape(-1, 3).copy()
+    vectors[among] = theta.reshape(-1, 3)
+    noise[among] = np.reshape(model.settings["noise_nT"], (-1, 3))
+    known = [float(f"{v:.4g}") for v in noise.ravel()]
+    return replace(model, sensors=(), settings={**model.settings, "noise_nT": known}), vectors.ravel()
+
+
 def _own_noise(state: State) -> Array:
     """(3 S,) nT, white noise of the outputs beside an adopted source.
 

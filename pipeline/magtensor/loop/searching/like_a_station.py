@@ -12,14 +12,16 @@ from numpy.typing import NDArray
 
 from magtensor.calibration.types import Array
 from magtensor.error_models.excitation import Excitation
+from magtensor.error_models.needs import measured
 from magtensor.error_models.terms import Terms, joined
 from magtensor.loop.evidence.assessment import WHITE, Colours, assess, estimated, estimated_in, explained
 from magtensor.loop.evidence.grams import Whitened
 from magtensor.loop.evidence.residual import Residual
 from magtensor.loop.fitting.model import Adopted, State
-from magtensor.loop.searching.contribution import a_tone, put_back, slices, tones_of
+from magtensor.loop.searching.contribution import a_tone, moments, put_back, slices, tones_of
 
 APART_ALPHA = 1e-4  # what no station does has to be as unlikely by chance
+HARDLY = 1e-3  # of the squares of |b| - F: a thirtieth of its size, to which the law of a drift is hardly known
 A_PART = 0.1  # of what a model explains of |b| - F has to be none of a station's
 COURSES = 20  # half waves over the survey: what a station does slowly, whatever the cause
 MORE_COURSES = 40  # the same of what is left, of which nobody knows how fast it is
@@ -30,10 +32,12 @@ MOSTLY = 0.5  # of what is left, beside white noise, is slow: of the platform or
 
 
 def as_a_station_would(state: State, place: int) -> bool:
-    """Whether a base station that drifts, or follows the channels of an adopted model, would look the same as it.
+    """Whether a base station that drifts, jumps when an adopted model does, or follows its channels, would look the
+    same as it; or the field itself, where a constant stands for a station.
 
-    It would where the model explains nothing of what differs between the sensors, and next to nothing of |b| - F beside
-    courses that all sensors see alike. What a vector in their axes makes turns with the platform: no station does that.
+    It would where the model explains nothing of what differs between the sensors, or a thousandth of what it explains
+    of |b| - F, and next to nothing of this beside courses that all sensors see alike. What a vector in their axes makes
+    turns with the platform: no station does that.
     """
     single = state.residual.across is None
     if state.residual.along is None or (single and not a_tone(state.adopted[place])):
@@ -43,13 +47,20 @@ def as_a_station_would(state: State, place: int) -> bool:
     mine, numbers = state.terms.only(range(own.start, own.stop)), range(state.terms.count)
     others = state.terms.only(i for i in numbers if not own.start <= i < own.stop)
     back, colours = put_back(state.residual, mine, state.theta[place]), state.colours
-    if not single and _beyond(replace(back, along=None), colours, mine, [others])[1] <= APART_ALPHA:
-        return False
     along = replace(back, across=None)
+    if not single:
+        apart, by_chance = _beyond(replace(back, along=None), colours, mine, [others])
+        if by_chance <= APART_ALPHA and apart > HARDLY * _beyond(along, colours, mine, [others])[0]:
+            return False
     alike = _of_a_station(state.excitation, state.adopted[place], back.samples)
     turning, by_chance = _beyond(along, colours, mine, [others, alike])
     either = turning + _beyond(along, colours, alike, [others])[0]
     return by_chance > APART_ALPHA or turning < A_PART * either
+
+
+def only_a_constant(x: Excitation) -> bool:
+    """Whether a constant stands for a base station: what the field does meanwhile nobody recorded."""
+    return x.total_field is not None and not measured(x.total_field)
 
 
 def turns_with_the_platform(state: State) -> bool:
@@ -116,12 +127,13 @@ def _half_waves(x: Excitation, count: int) -> Array:
 
 
 def _of_a_station(x: Excitation, model: Adopted, samples: NDArray[np.int_]) -> Terms:
-    """Courses of the total field that all sensors see alike, at some samples: slow ones, the tone of a model, and those
-    of a channel of it as it is logged and as the model follows it, with their squares."""
+    """Courses of the total field that all sensors see alike, at some samples: slow ones, the tone of a model, jumps at
+    its times, and those of a channel of it as it is logged and as the model follows it, with their squares."""
     lag = float(model.settings.get("lag_s", 0.0))
     followed = [_powers(x.channel(c, s)) for c in sorted(model.channels(x)) for s in dict.fromkeys((0.0, lag))]
     turns = 2.0 * np.pi * np.outer(x.elapsed, tones_of(model))
-    courses = np.hstack([_half_waves(x, COURSES), np.cos(turns), np.sin(turns), *followed])[samples]
+    jumps = (x.elapsed[:, None] >= moments(model)).astype(float)
+    courses = np.hstack([_half_waves(x, COURSES), np.cos(turns), np.sin(turns), jumps, *followed])[samples]
     return joined([x.on_reference(course, "nT", "") for course in courses.T])
 
 

@@ -35,7 +35,6 @@ from magtensor.loop.searching.keeping import (
 from magtensor.loop.searching.larger_law import follows_the_attitude, part_of_a_gradient, part_of_a_larger_law
 from magtensor.loop.searching.latent import NAME, Sought, renewed, sought, source_instead, tried_source
 from magtensor.loop.searching.likeness import followed_by_a_curve, part_of_the_source
-from magtensor.loop.searching.of_the_field_itself import of_the_field_itself
 from magtensor.loop.searching.on_fewer_sensors import on_those_needed
 from magtensor.loop.searching.on_more_sensors import in_the_place_of_others, on_more_sensors
 from magtensor.loop.searching.own_fit import at_their_own_fit
@@ -332,8 +331,7 @@ class Rounds:
             return why
         if self.whole is not None and (why := of_a_hole(chosen, state, self.whole, len(self.models))):
             return why
-        parts = part_of_a_larger_law(chosen, state) or part_of_a_gradient(chosen, state)
-        return parts or of_the_field_itself(chosen, state)
+        return part_of_a_larger_law(chosen, state) or part_of_a_gradient(chosen, state)
 
     def kept_with_another(
         self,

@@ -26,7 +26,7 @@ from magtensor.loop.remainder.flagged import lasting
 from magtensor.loop.searching.contribution import borne_out, eliminate, over_at_once, possible_without
 from magtensor.loop.searching.found import Search, Step
 from magtensor.loop.searching.gates import ALPHA
-from magtensor.loop.searching.latent import NAME, renewed, sought
+from magtensor.loop.searching.latent import NAME, of_every_sensor, renewed, sought
 from magtensor.loop.searching.on_fewer_sensors import on_those_that_show
 from magtensor.loop.searching.on_more_sensors import in_the_place_of_others
 from magtensor.loop.searching.overshadowed import overshadowed
@@ -183,6 +183,9 @@ def _among(names: tuple[str, ...], ended: Ended, rounds: Rounds) -> Ended | None
         return None
     new = slice(len(models), None)
     more, values = narrowed_to(found.state.adopted[new], found.state.theta[new], found.state, names)
+    for i, model in enumerate(more):
+        if model.name == NAME:
+            more[i], values[i] = of_every_sensor(model, values[i], ended.state)
     every, start = [*ended.state.adopted, *more], [*ended.state.theta, *values]
     record = replace(ended.record, waveform=found.record.waveform)
     how = replace(ended.how, noise=all_noise(joint_state(record, every, how, start, lines)))

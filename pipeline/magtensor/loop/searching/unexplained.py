@@ -41,7 +41,11 @@ from magtensor.loop.remainder.tones import channels_of_the_line, of_the_turning
 from magtensor.loop.remainder.turned_too_far import turned_too_far_words
 from magtensor.loop.searching.found import Search
 from magtensor.loop.searching.latent import LEFT_BY_LAWS, shared_words
-from magtensor.loop.searching.like_a_station import channels_of_the_total_field, turns_with_the_platform
+from magtensor.loop.searching.like_a_station import (
+    channels_of_the_total_field,
+    only_a_constant,
+    turns_with_the_platform,
+)
 from magtensor.loop.searching.suspects import Suspects
 from magtensor.sharing import shared_out
 
@@ -154,6 +158,8 @@ def _what_shows(found: Search, record: Record, excess: float, sparse: SparseRead
             cause = ": it turns with the platform, as the field of something on it that no channel logs"
         elif alike:
             cause = ": an error of the base station, or a field that it does not see, of the site or of the platform"
+            if only_a_constant(state.excitation):
+                cause = ": the field, of which only a constant is known, or one of the platform"
             if names := channels_of_the_total_field(state, ALPHA):
                 cause += f"; it follows {' and '.join(names)}"
         words.append(f"{slow:.3g} nT rms of |b| - F, {where}, is no white noise{cause}")
