@@ -54,3 +54,13 @@ def test_what_hardly_moves_or_is_short_shows_none() -> None:
     assert attitude_delay(TIME[:2], still[:2], b[:2], None) is None
     q, b = logged(0.08)
     assert attitude_delay(TIME[:100], q[:100], b[:100], None) is None
+
+
+def test_errors_of_a_calibration_by_few_samples_are_no_delay() -> None:
+    """They are the same function of the attitude all along, which in one motion may go with how it changes."""
+    time = TIME[:150]
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        motion = Rotation.from_euler("ZYX", 360.0 * rng.uniform(size=3), degrees=True) * attitude(2.5 * time)
+        b = motion.inv().apply(WORLD) @ (np.eye(3) + 2e-5 * rng.standard_normal((3, 3))).T
+        assert attitude_delay(time, motion.as_quat(), b, None) is None, seed
