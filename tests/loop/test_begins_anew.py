@@ -113,6 +113,22 @@ def test_outputs_come_before_the_dates(
     assert np.sqrt(np.mean(error**2)) < 0.17  # the noise is 0.15 nT; the jump moves |b| by 0.6 nT
 
 
+@pytest.mark.parametrize("more_nT", [0.0, 0.4], ids=["the sensor was never knocked", "its offset is a third one"])
+def test_offsets_from_before_a_jump_are_known_by_just_that_difference(
+    tmp_path: Path, found: Found, more_nT: float
+) -> None:
+    done, _ = found(STEP)
+    there = survey_file(tmp_path, of_a_day(6, start=LATER), "there.h5")
+    with h5py.File(there, "r+") as file:
+        file["b_raw"][:, 1] += more_nT * np.array([1.0, 1.0, -1.0])
+    b = done.calibration.apply(there)["calibrated/b"]
+    assert b.attrs.get("not_as_dated", "") == ("" if more_nT else "offset_step (not yet)")
+    if not more_nT:
+        with h5py.File(there) as file:
+            error = np.linalg.norm(b, axis=2) - file["truth/total_field_true"][()][:, None]
+        assert np.sqrt(np.mean(error**2)) < 0.17
+
+
 @pytest.mark.parametrize("again", [True, False])
 def test_a_slip_goes_on_where_the_outputs_show_it(tmp_path: Path, found: Found, again: bool) -> None:
     """Recorders begin in step on another day, but not all of them."""

@@ -20,7 +20,7 @@ from magtensor.loop.fitting.refit import joint_state
 from magtensor.loop.searching import latent, overshadowed, rounds, search
 from magtensor.loop.searching.contribution import borne_out, possible_without, without_models
 from magtensor.loop.searching.found import Search
-from magtensor.loop.searching.overshadowed import attitude_share, of_what_is_left_out
+from magtensor.loop.searching.overshadowed import attitude_share, of_a_restless_station, of_what_is_left_out
 from magtensor.registry import Registry
 
 MODELS = ("nonlinearity_quadratic", "nonlinearity_cubic", "current_field", "site_gradient")
@@ -304,3 +304,20 @@ def test_what_the_others_need_to_be_calibrated_stays() -> None:
     assert possible_without(record, state, [0], Fitting()) is None
     kept, dropped = borne_out(record, state, Fitting(), 0)
     assert kept is state and dropped == ()
+
+
+@pytest.mark.parametrize("wanders_nT", [0.0, 3.0])
+def test_a_small_error_of_a_base_station_that_wanders_is_a_part_of_that(wanders_nT: float) -> None:
+    """A clock that is five seconds late, and one that seems so beside a wander of minutes."""
+    record = synthetic(15, 1200, noise_nT=0.2)
+    assert record.total_field is not None
+    late = 50_000.0 + 10.0 * np.sin((np.arange(1200) - 5.0) / 90.0)
+    own = lfilter([1.0], [1.0, -0.99], np.random.default_rng(3).standard_normal(1200))
+    recorded = (late if wanders_nT == 0.0 else record.total_field) + wanders_nT * own / own.std()
+    record = replace(record, total_field=recorded, quiet_field=recorded)
+    clock = Adopted(Registry.load().find("error_model", "reference_clock"), {"lag_s": 0.0})
+    found = search.search(record, [], Fitting())
+    doubted = of_a_restless_station(replace(found, last=joint_state(record, [clock], Fitting())), 0)
+    assert (doubted is not None) is (wanders_nT > 0.0)
+    if doubted is not None:
+        assert doubted[0] == [0] and "nT that stay of it" in doubted[1]

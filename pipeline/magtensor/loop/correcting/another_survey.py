@@ -26,6 +26,7 @@ WARM_UP = "warm_up"  # begins with every survey, warmer in one than in another
 LEAST_CONTRAST = 1e-4  # of an effect's own power, between the sensors
 SIGNIFICANT = 4.0  # standard deviations, of what is found on another survey
 ROUNDING = 1e-6  # nT: a course no larger is none
+THE_SAME = 0.1  # of an offset, by which another may differ from it: of three components one in a thousand is as near
 LEAST_PARTS = 8  # of the survey, whose means tell how large slow noise is
 
 
@@ -256,3 +257,15 @@ def seen_in(left: Array, course: Array) -> tuple[float, bool]:
     part = float(np.sum(left * course)) / power
     variance = _variance(left - part * course, course, LEAST_PARTS)
     return part, part**2 * power > SIGNIFICANT**2 * variance
+
+
+def as_other_offsets(left: Array, course: Array) -> bool:
+    """Whether what is left (n, 3 S) has the mean of a course that is constant on this survey, in direction and size: no
+    other change of the offsets would, but by chance."""
+    mean, like = left.mean(axis=0), course.mean(axis=0)
+    size = float(np.linalg.norm(like))
+    if size <= ROUNDING or float(np.sum((course - like) ** 2)) > LEAST_CONTRAST * len(course) * size**2:
+        return False
+    parts = np.array([part.mean(axis=0) for part in np.array_split(left, min(LEAST_PARTS, len(left)))])
+    noise = float(np.sqrt(np.sum(np.var(parts, axis=0)) / len(parts)))
+    return float(np.linalg.norm(mean - like)) < THE_SAME * size and noise < THE_SAME * size

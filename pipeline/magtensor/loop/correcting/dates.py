@@ -17,7 +17,7 @@ from magtensor.calibration.by_sensor import by_sensor
 from magtensor.calibration.types import Array, ArrayCalibration
 from magtensor.error_models.excitation import Excitation
 from magtensor.error_models.settings import Duration, EventTimes, profiled
-from magtensor.loop.correcting.another_survey import Here, seen_in, shows_a_state
+from magtensor.loop.correcting.another_survey import Here, as_other_offsets, seen_in, shows_a_state
 from magtensor.loop.correcting.filled import filled
 from magtensor.loop.fitting.model import Adopted, Record
 
@@ -38,8 +38,9 @@ def as_dated_here(
     What the survey says comes before the dates: a drift of what is switched on with the survey and a jump at the same
     time of each begin anew, a jump was mended or has not happened yet, or the clock was never set. That has to be
     nearer to what is measured, and its course to be seen there whatever the offsets are, which differ from survey to
-    survey. A steady drift that goes on has the course of one that begins anew too, and is elsewhere. What is clearest
-    comes first: beside it the others may be seen that happened at one moment with it.
+    survey; or they differ by just what a jump was, as if it were not there. A steady drift that goes on has the course
+    of one that begins anew too, and is elsewhere. What is clearest comes first: beside it the others may be seen that
+    happened at one moment with it.
 
     Parameters
     ----------
@@ -72,7 +73,7 @@ def _nearest(
         course = here.added(other, theta) - dated
         nearer = 2.0 * float(np.sum(left * course)) - float(np.sum(course**2))
         part, known = seen_in(left, course)
-        if nearer > most and part > ANEW and known:
+        if nearer > most and ((part > ANEW and known) or (isinstance(here, Here) and as_other_offsets(left, course))):
             nearest, most = other, nearer
     return nearest, most
 

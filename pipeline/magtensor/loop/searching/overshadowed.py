@@ -8,7 +8,8 @@ taken out again. So is a tone that may be a harmonic of how the platform turns; 
 of the kind beside it is significant and predicts nothing, as where a sensor wanders, or where the sensors share a
 waveform that has no name and is larger, or switches along the same vectors: a step or a passage may be a part of it,
 or where nearly all that is left out of the calibration lies along its vector; so are tones close to each other along
-one vector, the sidebands of one whose strength or frequency changes;
+one vector, the sidebands of one whose strength or frequency changes; so is an error of the base station that is less
+than what stays of |b| - F;
 and a source that nobody logged, whose waveform may be a small part of any law that has no name. And whatever is larger,
 an effect with which held-out blocks are predicted worse than without it, once no noise is weighed against another, was
 one of a few samples that the colour of the noise made much of.
@@ -41,7 +42,7 @@ from magtensor.loop.remainder.predictable import (
 from magtensor.loop.searching.contribution import happens_once, moments, slices
 from magtensor.loop.searching.found import Search, without_and_with
 from magtensor.loop.searching.suspects import unlikely
-from magtensor.loop.searching.unexplained import unexplained
+from magtensor.loop.searching.unexplained import restless, unexplained
 
 WORSE = 1.01  # times the held-out rms without an effect, all noise alike: noise of a colour does not make up for that
 NAMELESS = 2.0  # times what stays, that a response to a logged vector explains if it is the law
@@ -59,6 +60,7 @@ def overshadowed(found: Search, fixed: int) -> tuple[list[int], str] | None:
     state, left = found.told, staying(found)
     weakest: tuple[float, list[int], str] | None = None
     part = _of_an_adopted_source(state, fixed) or of_what_is_left_out(found, fixed) or _of_one_tone(state, fixed)
+    part = part or of_a_restless_station(found, fixed)
     if part is not None:
         return part
     for places in _of_one_name(state, fixed):
@@ -172,6 +174,22 @@ def of_what_is_left_out(found: Search, fixed: int) -> tuple[list[int], str] | No
                 f"{'more' if more else 'as large'}: it acts at other times too",
             )
     return None
+
+
+def of_a_restless_station(found: Search, fixed: int) -> tuple[list[int], str] | None:
+    """The least error of the base station, where more than it stays of |b| - F and is no noise: of a station that
+    wanders any law is a part, or goes with it for a while."""
+    state = found.told
+    left = restless(state, found.record)
+    sizes = {
+        place: float(np.std(model.terms(state.excitation).on_reference(theta)[state.residual.samples]))
+        for place, (model, theta) in enumerate(zip(state.adopted, state.theta, strict=True))
+        if place >= fixed and model.component.effect == "reference"
+    }
+    if not sizes or min(sizes.values()) >= left:
+        return None
+    place = min(sizes, key=lambda p: sizes[p])
+    return [place], f"it makes {sizes[place]:.3g} nT rms of |b| - F, less than the {left:.3g} nT that stay of it"
 
 
 def _as_large(share: Array, samples: NDArray[np.int_], state: State, place: int) -> bool:

@@ -143,8 +143,7 @@ def _what_shows(found: Search, record: Record, excess: float, sparse: SparseRead
     # a field that turns sweeps through a law that it lacks, and what trembles has a line and not another time
     words.extend([] if predictable or line is not None else jitter_words(state))
     words.extend(changing)
-    noise = float(np.hypot(OwnNoise(state.residual, None).slow_along(), of_the_station(state, record)))
-    noise = float(np.hypot(noise, sparse.between if sparse is not None else 0.0))
+    noise = noise_along(state, record, sparse)
     slow, alike = slow_along(state), _seen_alike(state.residual)
     turning = slow > TWICE * noise and alike and turns_with_the_platform(state)
     no_station = turning and state.residual.across is not None  # what one sensor wanders by turns as well
@@ -222,6 +221,20 @@ def of_the_station(state: State, record: Record) -> float:
         return 0.0
     loud = (record.total_field - record.quiet_field)[state.residual.samples]
     return float(np.sqrt(np.mean((loud - loud.mean()) ** 2)))
+
+
+def noise_along(state: State, record: Record, sparse: SparseReadings | None) -> float:
+    """nT rms of |b| - F that the sensors' own slow noise makes, the base station's, and what it misses in between."""
+    own, station = OwnNoise(state.residual, None).slow_along(), of_the_station(state, record)
+    return float(np.hypot(np.hypot(own, station), sparse.between if sparse is not None else 0.0))
+
+
+def restless(state: State, record: Record) -> float:
+    """nT rms of |b| - F, where that is far beyond noise: something moves it that has no name; else 0."""
+    slow = slow_along(state)
+    if slow <= MUCH * state.residual.scale:
+        return 0.0
+    return slow if slow > TWICE * noise_along(state, record, sparse_readings(state, record)) else 0.0
 
 
 def slow_along(state: State) -> float:
