@@ -262,6 +262,24 @@ def test_a_step_along_whose_vector_more_is_left_out_is_a_part_of_that(along: boo
         assert doubted[0] == [0] and "299 samples" in doubted[1]
 
 
+@pytest.mark.parametrize("sensor", [1, 2])
+def test_an_event_of_a_sensor_that_does_other_things_too_is_no_lone_one(sensor: int) -> None:
+    """Its axes are magnetised one way and the other, each by itself; one that stayed so for long seems to be an event.
+    Beside the same of another sensor it may be one."""
+    record = synthetic(16)
+    raw, share = record.raw.copy(), np.zeros((1200, 3))
+    raw[300:800, 1, 2] += 6.0
+    share[50:170, 0], share[850:1100, 1] = 6.0, -6.0
+    found = search.search(replace(record, raw=raw), [Registry.load().find("error_model", "offset_while")], Fitting())
+    assert [(a.name, a.sensors) for a in found.last.adopted] == [("offset_while", ("S2",))]
+    raw[:, sensor] += share
+    last = replace(found.last, fit=replace(found.last.fit, keep=found.last.fit.keep & ~share.any(axis=1)))
+    doubted = of_what_is_left_out(replace(found, record=replace(record, raw=raw), last=last, evenly=None), 0)
+    assert (doubted is not None) is (sensor == 1)
+    if doubted is not None:
+        assert doubted[0] == [0] and "it does more than such events tell" in doubted[1]
+
+
 def test_a_step_that_is_undone_at_other_times_is_a_part_of_what_switches() -> None:
     """On for a while before the step, off for a while after it, all of that left out: as large either way round."""
     vector = np.random.default_rng(4).standard_normal((4, 3))

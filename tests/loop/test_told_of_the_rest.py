@@ -362,8 +362,17 @@ def test_outputs_in_coarse_steps_have_no_loud_stretches() -> None:
     state = linear_state(coarse)
     assert loud_stretches(coarse, state, Fitting()) == ()
     (words,) = Loud.of(state, coarse, Fitting()).words
-    assert words == "the outputs come in steps of 2 nT, and rounding makes more of what is left than noise"
+    assert words == "the outputs come in steps of 2 nT, whose rounding makes most of the noise"
     assert rounding(clean, linear_state(clean)) == 0.0
+
+
+@pytest.mark.parametrize(("noise_nT", "told"), [(0.5, True), (3.0, False)])
+def test_steps_are_told_of_outputs_that_never_repeat_one(noise_nT: float, told: bool) -> None:
+    """A platform that turns sweeps over twelve thousand steps of 8 nT; they make 2.3 nT of noise."""
+    record = synthetic(6, SAMPLES, noise_nT=noise_nT)
+    coarse = replace(record, raw=np.round(record.raw / 8.0) * 8.0)
+    words = Loud.of(linear_state(coarse), coarse, Fitting()).words
+    assert ("the outputs come in steps of 8 nT, whose rounding makes most of the noise" in words) is told
 
 
 @pytest.mark.parametrize(("unseen_nT", "told"), [(4.0, True), (0.3, False)])

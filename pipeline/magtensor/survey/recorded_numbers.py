@@ -13,7 +13,7 @@ Bools = NDArray[np.bool_]
 LOOKED_AT = 200_000  # samples; a step shows in these as in ten million
 
 
-def resolution(values: Floats) -> float:
+def resolution(values: Floats, *, repeats: float = 0.1) -> float:
     """The quantisation step of a channel, 0 where none shows.
 
     The largest number of which (nearly) all differences between recorded values are whole multiples, found as
@@ -22,11 +22,12 @@ def resolution(values: Floats) -> float:
 
     Args:
         values: (N,) numbers, NaN allowed.
+        repeats: the part of them that have to be equal to another one; none of what sweeps over all its range.
     """
     thinned = values[:: max(1, len(values) // LOOKED_AT)]
     finite = thinned[np.isfinite(thinned)]
     distinct = np.unique(finite)
-    if len(distinct) < 3 or len(distinct) > 0.9 * len(finite):
+    if len(distinct) < 3 or len(distinct) > (1.0 - repeats) * len(finite):
         return 0.0
     largest = max(abs(distinct[0]), abs(distinct[-1]))
     steps = np.diff(distinct)

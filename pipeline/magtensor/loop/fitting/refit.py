@@ -33,6 +33,7 @@ _SLACK = 4.0  # in the error accepted while an effect may yet turn out to cause 
 SETTLED = 0.02  # of a standard deviation
 HARDLY_SHOWN = 1e3  # times the variance that a coefficient would have alone
 SHOWN = 3.0  # standard deviations
+MOST_OF_THE_NOISE = 0.5  # of its square
 _SHARES = (1.0, 0.5, 0.1)  # of a step, tried in this order
 _LIKELIHOOD_ROUNDING = 0.5  # a spectrum fitted anew is not the same to the last digit
 
@@ -265,12 +266,12 @@ def _fit(
 
 
 def rounding(record: Record, state: State) -> float:
-    """nT, the steps that the outputs come in, where rounding makes more of them than the noise does; 0 elsewhere."""
+    """nT, the steps that the outputs come in, where rounding makes most of their noise; 0 elsewhere."""
     from magtensor.survey.recorded_numbers import resolution
 
     outputs = record.raw.reshape(len(record.raw), -1)
-    step = float(np.median([resolution(output) for output in outputs.T]))
-    return step if step**2 / 12.0 > float(np.median(state.residual.noise)) ** 2 else 0.0
+    step = float(np.median([resolution(output, repeats=0.0) for output in outputs.T]))
+    return step if step**2 / 12.0 > MOST_OF_THE_NOISE * float(np.median(state.residual.noise)) ** 2 else 0.0
 
 
 def loud_stretches(record: Record, state: State, how: Fitting) -> tuple[tuple[float, float], ...]:

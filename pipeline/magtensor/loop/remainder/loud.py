@@ -31,7 +31,7 @@ class Loud:
         from scipy.ndimage import median_filter
 
         if step := rounding(record, state):
-            words = f"the outputs come in steps of {step:.3g} nT, and rounding makes more of what is left than noise"
+            words = f"the outputs come in steps of {step:.3g} nT, whose rounding makes most of the noise"
             return cls([words], [])
         if state.residual.across is None or len(state.residual.across) < 4 * LEAST_LOUD:
             return cls([], [])

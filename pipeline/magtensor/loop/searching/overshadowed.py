@@ -48,6 +48,8 @@ WORSE = 1.01  # times the held-out rms without an effect, all noise alike: noise
 NAMELESS = 2.0  # times what stays, that a response to a logged vector explains if it is the law
 LONE = 2  # events along one vector may be all that happened, where nothing stays
 ALONG = 0.95  # cosine, with a source's vector or another event's; of one sensor 5 % of all directions are as near
+MUCH_OF_IT = 0.5  # of what an event explains, that is left out of the calibration
+FACTOR = 2.0  # of its size, that this may differ by: what is far larger is another thing
 AS_MUCH = 0.25  # of an event, that it may differ by from what it is at another time
 SIDEBANDS = 3  # tones along one vector, and no two of them harmonics of what is between them
 CLOSE = 1.5  # times the lowest of their frequencies; the second and third harmonic are as far apart
@@ -164,9 +166,15 @@ def of_what_is_left_out(found: Search, fixed: int) -> tuple[list[int], str] | No
         size = float(np.linalg.norm(seen))
         along = float(np.sum((off @ seen) ** 2)) / size**2 - len(off) if size > 0.0 else 0.0
         (series,) = state.adopted[place].terms(state.excitation).series[~out].T
+        explains = size**2 * float(np.sum((series - series.mean()) ** 2))
         if along <= ALONG**2 * beyond:
+            if _of_its_sensor(off, vector, left.projector, beyond, size) and beyond > MUCH_OF_IT * explains:
+                return [place], (
+                    f"what {len(off)} samples that fit no calibration are off by is of the same sensor and as large, "
+                    "along other vectors: it does more than such events tell"
+                )
             continue
-        more = along > size**2 * float(np.sum((series - series.mean()) ** 2))
+        more = along > explains
         if more or _as_large(off @ seen / size**2, np.flatnonzero(out), state, place):
             return (
                 [place],
@@ -174,6 +182,19 @@ def of_what_is_left_out(found: Search, fixed: int) -> tuple[list[int], str] | No
                 f"{'more' if more else 'as large'}: it acts at other times too",
             )
     return None
+
+
+def _of_its_sensor(off: Array, vector: Array, projector: Array, beyond: float, size: float) -> bool:
+    """Whether what samples (n, 3 S) are off by, in sum `beyond` noise, is nearly all of the one sensor that an event
+    (3 S,) acts on, and the most of them by as much as the event's `size`."""
+    acts_on = np.flatnonzero(vector.reshape(-1, 3).any(axis=1))
+    if len(acts_on) != 1:
+        return False
+    (sensor,) = acts_on
+    own = np.linalg.qr(projector[:, 3 * sensor : 3 * sensor + 3])[0]
+    of_it = float(np.sum((off @ own) ** 2)) - own.shape[1] * len(off)
+    usual = float(np.median(np.linalg.norm(off @ own, axis=1)))
+    return of_it > ALONG**2 * beyond and size / FACTOR < usual < FACTOR * size
 
 
 def of_a_restless_station(found: Search, fixed: int) -> tuple[list[int], str] | None:
