@@ -33,6 +33,7 @@ _SLACK = 4.0  # in the error accepted while an effect may yet turn out to cause 
 SETTLED = 0.02  # of a standard deviation
 HARDLY_SHOWN = 1e3  # times the variance that a coefficient would have alone
 SHOWN = 3.0  # standard deviations
+OF_A_LAW = 1e-3  # of what it explains: no law is known better
 MOST_OF_THE_NOISE = 0.5  # of its square
 _SHARES = (1.0, 0.5, 0.1)  # of a step, tried in this order
 _LIKELIHOOD_ROUNDING = 0.5  # a spectrum fitted anew is not the same to the last digit
@@ -275,8 +276,8 @@ def rounding(record: Record, state: State) -> float:
 
 
 def loud_stretches(record: Record, state: State, how: Fitting) -> tuple[tuple[float, float], ...]:
-    """s, from when to when the noise is so loud that the calibration is better without these samples. A stretch of
-    which a fit doubts most is wrong, and not loud."""
+    """s, from when to when the noise is so loud that the calibration is better without these samples; none beside an
+    effect a thousand times as large. A stretch of which a fit doubts most is wrong, and not loud."""
     if rounding(record, state):
         return ()  # outputs that are repeated tell no noise
     each = [a.terms(state.excitation) for a in state.adopted]
@@ -285,6 +286,8 @@ def loud_stretches(record: Record, state: State, how: Fitting) -> tuple[tuple[fl
     effects = [
         without(record, [terms], [-theta])[0] - record.raw for terms, theta in zip(each, state.theta, strict=True)
     ]
+    if any(float(np.std(effect)) * OF_A_LAW > float(np.median(state.residual.noise)) for effect in effects):
+        return ()  # it may be what their laws leave
     loud = too_loud(state.fit, raw, reference, effects, how.reference_noise)
     edges = np.flatnonzero(np.diff(loud.astype(int), prepend=0, append=0)).reshape(-1, 2)
     believed = [(first, end) for first, end in edges if np.mean(state.fit.keep[first:end]) >= 1.0 - MOSTLY]
