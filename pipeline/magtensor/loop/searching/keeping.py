@@ -137,14 +137,13 @@ def why_not(record: Record, before: Trial, after: Trial, chosen: Candidate, how:
     if not two_channels and already(same, model.component, model.settings):
         return ONE_OF_A_KIND
     slow, channels = hardly_begun(chosen.model, x), sorted(model.channels(x))
-    field = only_a_constant(x)
-    if (field or slow or channels or a_tone(model)) and as_a_station_would(after.state, which):
-        if field:
-            return (
-                "fitted, all sensors show it alike: the field, of which only a constant is known, would look the same"
-            )
+    unrecorded = only_a_constant(x)
+    if (unrecorded or slow or channels or a_tone(model)) and as_a_station_would(after.state, which):
         drift = "drifts" if slow else f"follows {' and '.join(channels)}" if channels else "has its period"
-        return f"fitted, all sensors show it alike: an error of the base station that {drift} would look the same"
+        other = f"an error of the base station that {drift}"
+        if unrecorded:
+            other = "the field, of which only a constant is known,"
+        return f"fitted, all sensors show it alike: {other} would look the same"
     if hardly_begun(model, x) and ((not slow and chosen.moved is None) or began_with_a_vector(model)):
         # of two of a kind one may be slow, and so may what was so at first sight, unless it is all that dies away
         return "fitted, it lags by more than half of the survey: any drift would do as well"
