@@ -203,9 +203,8 @@ JUMPS: dict[str, dict[str, Any]] = {
 }
 
 
-@pytest.mark.parametrize(
-    "effect", ["turn_step", *(pytest.param(e, marks=pytest.mark.long) for e in JUMPS if e != "turn_step")]
-)
+@pytest.mark.long
+@pytest.mark.parametrize("effect", JUMPS)
 def test_a_jump_lasts_into_later_surveys(effect: str, tmp_path: Path) -> None:
     """The same sensors' last minutes as a survey of their own, whose start lies after the jump."""
     jump = {"type": effect, "rms_nT": 3.0, "sensors": ["S2"]} | JUMPS[effect]

@@ -86,6 +86,7 @@ def test_delays_of_sensors_are_found_to_all_orders(tmp_path: Path, rate_Hz: floa
     assert told["adopted"][0]["evidence"]["held_out_rms_after_nT"] < 1.3 * NOISE_NT
 
 
+@pytest.mark.long
 def test_of_two_sensors_one_that_is_late_is_told_from_one_that_is_filtered(tmp_path: Path) -> None:
     """Before a delay is fitted the noise of two sensors seems larger, and models are compared across that."""
     pair = scenario(6, late(0.0, 0.006))

@@ -127,8 +127,9 @@ def test_a_base_station_that_is_restless_for_a_while_is_no_vehicle(tmp_path: Pat
     assert told["unexplained"]["present"]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("closest_m", "means"), [
-    (8.0, "it passed these"), pytest.param(60.0, "may have passed the base station", marks=pytest.mark.long),
+    (8.0, "it passed these"), (60.0, "may have passed the base station"),
 ])  # fmt: skip
 def test_a_passage_is_near_or_anywhere(closest_m: float, means: str, tmp_path: Path) -> None:
     """As strong in either case, a car or a ship: the gradient tells."""

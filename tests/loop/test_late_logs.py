@@ -164,6 +164,7 @@ def test_a_time_constant_is_told_from_a_delay(tmp_path: Path) -> None:
     assert adopted["settings"]["lag_s"] == pytest.approx(3.0, abs=0.1)
 
 
+@pytest.mark.long
 def test_a_log_in_time_is_not_said_to_be_late(tmp_path: Path) -> None:
     effect = {"type": "current_field", "channel": "current_heater", "rms_nT": 0.5}
     told = verdict_of(tmp_path, scenario(32, effect), models=["current_field", "offset_drift"])

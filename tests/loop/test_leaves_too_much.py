@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
 from loop_cases import BASE, linear_state, loaded, looked_at, scenario
 
 from magtensor.loop.fitting.model import Adopted, Fitting
@@ -15,6 +16,7 @@ from magtensor.registry import Registry
 NONE = [1e-9, 1e-9, 1e-9]  # s
 
 
+@pytest.mark.long
 def test_filters_of_one_sensor_are_kept_though_their_rest_reaches_the_others(tmp_path: Path) -> None:
     """Axes with time constants of 20 to 80 ms, and a law of one: a tenth of their 800 nT stays."""
     quick = {"rate_Hz": 10.0, "motion": BASE["motion"] | {"duration_s": 200.0, "rate_rms_deg_s": 50.0}}

@@ -181,8 +181,9 @@ def test_a_source_that_nobody_logged_and_that_switches_is_no_step(tmp_path: Path
     require_latent_source_alone(verdict_of(tmp_path, scenario(8, unlogged), models=BESIDE_A_SOURCE))
 
 
-@pytest.mark.parametrize("array", [ONE_SENSOR, pytest.param(TWO_SENSORS, marks=pytest.mark.long)])
-@pytest.mark.parametrize("rms_nT", [pytest.param(None, marks=pytest.mark.long), 3.0])
+@pytest.mark.long
+@pytest.mark.parametrize("array", [ONE_SENSOR, TWO_SENSORS])
+@pytest.mark.parametrize("rms_nT", [None, 3.0])
 def test_few_sensors(tmp_path: Path, array: dict[str, Any], rms_nT: float | None) -> None:
     instrument = scenario()["instrument"] | {"array": array}
     effects = () if rms_nT is None else ({"type": "current_field", "rms_nT": rms_nT, "channel": "current_heater"},)

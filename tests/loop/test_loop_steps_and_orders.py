@@ -113,7 +113,8 @@ def test_noise_of_the_base_station_is_no_delay_of_it(tmp_path: Path) -> None:
     np.testing.assert_allclose(adopted.settings["lag_s"], 40.0, atol=10.0)
 
 
-@pytest.mark.parametrize("part", [pytest.param(0.5, marks=pytest.mark.long), 0.9])
+@pytest.mark.long
+@pytest.mark.parametrize("part", [0.5, 0.9])
 def test_a_jump_while_a_posture_is_held_has_its_time_to_a_sample(tmp_path: Path, part: float) -> None:
     """The turns, which nobody recorded, are longer than the samples about the time that white noise shows."""
     rest, turn, at = 2.0, 2.1, 28

@@ -48,6 +48,7 @@ def test_a_scale_factor_takes_the_offset_with_it_or_not(of_field: bool, tmp_path
     assert told["adopted"][0]["evidence"]["held_out_rms_after_nT"] < 1.1 * told["noise_floor_nT"]
 
 
+@pytest.mark.long
 def test_a_cubic_term_of_the_field(tmp_path: Path) -> None:
     def change(path: Path) -> None:
         with h5py.File(path, "a") as file:

@@ -16,9 +16,10 @@ MODELS = [
 OFF: dict[str, Any] = {"type": "reference_step", "steps_nT": [1.2, -1.2], "time_s": [FROM_S, UNTIL_S]}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "motion",
-    [pytest.param(None, marks=pytest.mark.long), {"type": "limited_tilt", "duration_s": 1200.0, "tilt_deg": 25.0}],
+    [None, {"type": "limited_tilt", "duration_s": 1200.0, "tilt_deg": 25.0}],
 )
 def test_a_level_that_comes_and_goes_is_one_effect(motion: dict[str, Any] | None, tmp_path: Path) -> None:
     sections = {} if motion is None else {"motion": motion}

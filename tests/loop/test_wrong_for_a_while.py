@@ -85,6 +85,7 @@ def test_what_is_wrong_throughout_is_not_said_to_lack_attitudes(tmp_path: Path) 
     assert "attitudes" not in str(refused.value) and "nominal" not in str(refused.value)
 
 
+@pytest.mark.long
 def test_what_a_wrong_sensor_spoils_elsewhere_is_no_noise() -> None:
     """With its samples in the fit what is left grows as the platform turns, in all sensors, as if these were loud."""
     record = synthetic(3, samples=2400, noise_nT=0.2, turning_s=60.0)

@@ -21,6 +21,7 @@ from .types import Array, SensorCalibration
 PARAMETERS = 9
 FOLDS = 10
 LEAST_PER_FOLD = 5
+ASTRAY = 10.0  # of the field: a sensor is nominal within a part of it
 _ROUNDS = 5  # Newton steps; the problem is linear but for the square of the error over F
 _SYMMETRIC = np.array([(0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1)])
 
@@ -166,6 +167,6 @@ def _fit(raw: Array, total_field: Array, jacobian: Array, basis: Array, field: f
     for _ in range(_ROUNDS):
         step = basis @ np.linalg.lstsq(r, q.T @ _residual(theta, raw, total_field, field), rcond=None)[0]
         theta = theta + step
-        if np.max(np.abs(step)) < 1e-9 * field:
-            break
+        if np.max(np.abs(step)) < 1e-9 * field or np.max(np.abs(theta)) > ASTRAY * field:
+            break  # a combination that nothing determines may run away: it predicts nothing, wherever it is stopped
     return theta
