@@ -18,6 +18,7 @@ from magtensor.runner import run
 SEARCHED = ["reference_clock", "reference_scale", "reference_drift", "scale_drift"]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("delay_s", "seed", "beyond_s"),
     [

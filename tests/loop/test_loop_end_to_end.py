@@ -230,6 +230,7 @@ def test_static_postures(tmp_path: Path, effect: dict[str, Any] | None) -> None:
         assert found["adopted"] == [] and not found["unexplained"]["present"]
 
 
+@pytest.mark.long
 def test_no_position_and_no_channel(tmp_path: Path) -> None:
     def without_position(path: Path) -> None:
         with h5py.File(path, "r+") as file:

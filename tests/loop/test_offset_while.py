@@ -23,6 +23,7 @@ def magnet(strength: float, sensors: int) -> list[dict[str, Any]]:
     ]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("sensors", "strength"),
     [

@@ -31,6 +31,7 @@ def spiked(path: Path) -> None:
         file["b_raw"][:] = raw
 
 
+@pytest.mark.long
 def test_neither_blocks_held_out_nor_another_survey_see_them(tmp_path: Path) -> None:
     """Rows that are means over 0.15 s: what an effect makes of the field beside a spike would be off by thousands."""
     effect = {"type": "averaging", "spread_s2": [0.15**2 / 12.0] * 4}
