@@ -19,7 +19,7 @@ MOST_SAMPLES = 5000
 LONGEST_STEPS = 64.0  # steps between samples: a longer delay is another mistake
 LONGEST = 0.1  # of the samples, that are left out at either end
 MOST_LEFT = 0.5  # of the square of the misfit: with more, the delay is not what most of it is
-PARTS = 4  # of the survey, in each of which the delay of the others has to serve
+PARTS = 4  # of the survey; the delay of the others has to serve in each, by the sum over them
 ROUNDS = 24  # of the search between two neighbours of the grid
 FEWER_ROUNDS = 10  # to a hundredth of what is between these
 

@@ -33,6 +33,7 @@ from magtensor.loop.evidence.assessment import estimated
 from magtensor.loop.evidence.residual import taken_off
 from magtensor.loop.fitting.model import Adopted, State
 from magtensor.loop.fitting.refit import everywhere
+from magtensor.loop.remainder.limited_band import TOLD_APART
 from magtensor.loop.remainder.predictable import (
     MOST_OF_IT,
     attitude_part,
@@ -186,9 +187,9 @@ def of_what_is_left_out(found: Search, fixed: int) -> tuple[list[int], str] | No
 
 def _of_its_sensor(off: Array, vector: Array, projector: Array, beyond: float, size: float) -> bool:
     """Whether what samples (n, 3 S) are off by, in sum `beyond` noise, is nearly all of the one sensor that an event
-    (3 S,) acts on, and the most of them by as much as the event's `size`."""
+    (3 S,) acts on, and the most of them by as much as the event's `size`. Two sensors do not tell whose it is."""
     acts_on = np.flatnonzero(vector.reshape(-1, 3).any(axis=1))
-    if len(acts_on) != 1:
+    if len(acts_on) != 1 or len(vector) < 3 * TOLD_APART:
         return False
     (sensor,) = acts_on
     own = np.linalg.qr(projector[:, 3 * sensor : 3 * sensor + 3])[0]
