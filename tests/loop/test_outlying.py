@@ -101,6 +101,19 @@ def test_few_spikes_are_told_where_no_tail_of_noise_reaches(times: float, told: 
     assert not told or ("5 samples (0.4%)" in words[0] and "on S2" in words[0])
 
 
+def test_where_what_is_slow_goes_furthest_is_no_spike() -> None:
+    """A sensor that moves by up to twenty times its noise within some dozen samples, where two of them are left out."""
+    sensor = np.zeros((1200, 4, 3))
+    sensor[:, 2] = 3.5 * np.sin(2.0 * np.pi * np.arange(1200) / 120.0)[:, None] ** 9
+    found, _ = found_in(synthetic(18, 1200, added=sensor, turning_s=4.0))
+    left_out = np.zeros(1200, dtype=bool)
+    left_out[30::120] = True
+    left_out[31::120] = True
+    left_out[33::120] = True
+    (words,) = spike_words(found, left_out)
+    assert words.startswith("single samples: 30 samples") and "on S3, hardly further off than those beside" in words
+
+
 def test_spikes_of_the_total_field_are_no_sensors() -> None:
     record = synthetic(10, 1200, turning_s=4.0)
     assert record.total_field is not None

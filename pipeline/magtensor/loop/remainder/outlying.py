@@ -125,7 +125,7 @@ def outlying_words(found: Outlying, left_out: Mask) -> tuple[list[str], Mask]:
 
 def spike_words(found: Outlying, spikes: Mask) -> list[str]:
     """How many samples are left out as spikes, by how much they are off, mostly on which sensors; nothing of few that
-    the tails of noise may hold."""
+    the tails of noise may hold. What is slow goes furthest in single samples too: they are no spikes."""
     worst, at = np.zeros(int(spikes.sum()), dtype=int), np.flatnonzero(spikes)
     size, names, count = found.beside[at], found.names, len(at)
     far = count > LONGEST_SPIKE and bool(names) and np.median(found.square[at].max(axis=1)) > FAR_OFF**2
@@ -137,8 +137,13 @@ def spike_words(found: Outlying, spikes: Mask) -> list[str]:
         size = np.where(size > 0, size, own)
     counts = np.bincount(worst, minlength=len(names) + 1)
     most = [name for name, n in zip((*names, "|b| - F"), counts, strict=True) if n > MOSTLY * counts.max()]
+    theirs = at[worst < len(names)]
+    by_themselves = not len(theirs) or np.mean(np.any(found.wrong[theirs], axis=1)) > 0.5
+    what, as_others = (
+        ("spikes", "") if by_themselves else ("single samples", ", hardly further off than those beside them")
+    )
     return [
-        f"spikes: {count} samples ({count / len(spikes):.1%}) fit no calibration, by {np.median(size):.3g} nT in "
-        f"the median, {'mostly ' if counts.max() < count else ''}on {', '.join(most)}: they are flagged and have no "
-        "part in the calibration"
+        f"{what}: {count} samples ({count / len(spikes):.1%}) fit no calibration, by {np.median(size):.3g} nT in "
+        f"the median, {'mostly ' if counts.max() < count else ''}on {', '.join(most)}{as_others}: they are flagged and "
+        "have no part in the calibration"
     ]

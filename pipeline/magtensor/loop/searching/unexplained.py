@@ -39,6 +39,7 @@ from magtensor.loop.remainder.predictable import attitude_words, converter_words
 from magtensor.loop.remainder.sparse_readings import SparseReadings, sparse_readings
 from magtensor.loop.remainder.tones import channels_of_the_line, of_the_turning
 from magtensor.loop.remainder.turned_too_far import turned_too_far_words
+from magtensor.loop.remainder.with_the_field import with_the_field
 from magtensor.loop.searching.found import Search
 from magtensor.loop.searching.latent import LEFT_BY_LAWS, shared_words
 from magtensor.loop.searching.like_a_station import (
@@ -141,8 +142,9 @@ def _what_shows(found: Search, record: Record, excess: float, sparse: SparseRead
     words.extend([] if predictable else turned_too_far_words(state))
     words.extend(shortened_words(state))
     # a field that turns sweeps through a law that it lacks, and what trembles has a line and not another time
-    words.extend([] if predictable or line is not None else jitter_words(state))
-    words.extend(changing)
+    scattered = [] if predictable or line is not None else jitter_words(state)
+    words.extend([*scattered, *changing])
+    words.extend([] if predictable or changing else with_the_field(state, stamps=not scattered))
     noise = noise_along(state, record, sparse)
     slow, alike = slow_along(state), _seen_alike(state.residual)
     turning = slow > TWICE * noise and alike and turns_with_the_platform(state)
@@ -206,7 +208,7 @@ def noise_words(state: State, record: Record, band: Band | None) -> list[str]:
             each = zip(sensors, np.sqrt(np.maximum(_beyond_white(residual), 0.0)), axis, strict=True)
             slower = [f"{slow:.2g} nT rms on {name}" for name, slow, least in each if slow > least]
             if 0 < len(slower) < len(sensors):
-                words.append(f"slow noise, as a vector: {', '.join(slower)}")
+                words.append(f"not white, as a vector: {', '.join(slower)}")
     if (slow := slow_along(state)) > white:
         station = of_the_station(state, record)
         makes = "may make all" if station > slow else f"makes {station:.2g} nT"  # known from how its readings scatter
