@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from loop_cases import Array, synthetic
 
-from magtensor.loop.searching.likeness import _correlations, followed, followed_in_part
+from magtensor.loop.searching.likeness import _correlations, followed, followed_by_a_product, followed_in_part
 
 SAMPLES = 1200
 
@@ -42,6 +42,18 @@ def test_what_has_nothing_to_do_with_a_source_is_not_named(seed: int) -> None:
     record = replace(synthetic(1, SAMPLES), logged=channels)
     for source in (telegraph(rng, 60.0), smooth(rng, 40.0), telegraph(rng, 300.0)):
         assert followed_in_part(record.time, source, record) == ""
+        assert followed_by_a_product(record.time, source, record) == ""
+
+
+def test_the_product_of_two_channels_is_named_as_that() -> None:
+    """A current whose field the temperature of a core makes stronger and weaker."""
+    rng = np.random.default_rng(2)
+    temperature, heater = smooth(rng, 20.0), telegraph(rng, 30.0)
+    record = replace(synthetic(1, SAMPLES), logged={"rain": smooth(rng, 30.0), "heater": heater, "core": temperature})
+    product = (temperature / temperature.std() + 0.3) * heater + 0.2 * rng.standard_normal(SAMPLES)
+    assert followed_by_a_product(record.time, product, record) == "heater times core"
+    alone = 2.0 * heater + temperature / temperature.std() + 0.2 * rng.standard_normal(SAMPLES)
+    assert followed_by_a_product(record.time, alone, record) == ""  # the sum of both
 
 
 @pytest.mark.parametrize("lag", [0, 7])

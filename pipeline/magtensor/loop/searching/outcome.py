@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from magtensor.calibration.types import Array
 from magtensor.error_models.excitation import Excitation
 from magtensor.error_models.settings import Beginning, Bends, EventTimes, Forms, Frequencies, Range, profiled
 from magtensor.error_models.waveform import NAME
@@ -17,7 +18,7 @@ from magtensor.loop.searching.beginnings import lags
 from magtensor.loop.searching.contribution import happens_once
 from magtensor.loop.searching.found import Search, Step, without_and_with
 from magtensor.loop.searching.gates import Candidate
-from magtensor.loop.searching.likeness import followed_in_part
+from magtensor.loop.searching.likeness import followed_by_a_product, followed_in_part
 from magtensor.loop.searching.on_fewer_sensors import named
 
 AS_FAST = 0.15  # of a time constant
@@ -112,8 +113,8 @@ def _adopted(found: Search, record: Record, index: int) -> dict[str, Any]:
     means = means or _as_another_begins(state, index)
     like = "" if step is None else step.like
     hidden = model.name == NAME and record.waveform is not None
-    if hidden and (follows := followed_in_part(record.time, np.asarray(record.waveform), record)):
-        means, like = means or f"goes as {follows}, and rests else", ""
+    if hidden and (course := _course_of(np.asarray(record.waveform), record)):
+        means, like = means or course, ""
     return {
         "error_model": model.name,
         "kind": model.component.effect,
@@ -129,6 +130,14 @@ def _adopted(found: Search, record: Record, index: int) -> dict[str, Any]:
         **({"means": means} if means else {}),
         **({"most_like_channel": like} if like else {}),
     }
+
+
+def _course_of(waveform: Array, record: Record) -> str:
+    """What of logged channels a source that nobody logged goes as, in words; "" where it is like none of these."""
+    if follows := followed_in_part(record.time, waveform, record):
+        return f"goes as {follows}, and rests else"
+    product = followed_by_a_product(record.time, waveform, record)
+    return f"goes as {product}, as what follows one of them and is in proportion to the other" if product else ""
 
 
 def _as_another_begins(state: State, index: int) -> str:
