@@ -49,10 +49,11 @@ def test_slow_noise_is_no_effect_but_its_amount_is_told() -> None:
 
 
 def test_slow_noise_of_one_sensor_is_told_where_the_others_hide_it_in_the_sum() -> None:
-    """Random telegraph noise of an axis: two levels, some 40 s each."""
-    rng = np.random.default_rng(16)
+    """An axis that wanders by 2 nT rms within some 20 s."""
+    bell = np.exp(-0.5 * (np.arange(-80, 81) / 20.0) ** 2)
+    course = np.convolve(np.random.default_rng(16).standard_normal(2560), bell, mode="valid")
     added = np.zeros((2400, 4, 3))
-    added[:, 2, 1] = np.where(np.cumsum(rng.random(2400) < 1 / 40) % 2, 2.0, -2.0)
+    added[:, 2, 1] = 2.0 * course / course.std()
     record = synthetic(6, added=added, samples=2400)
     told = unexplained(search(record, [], Fitting()), record)
     assert not told["present"]

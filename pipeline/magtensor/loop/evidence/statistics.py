@@ -28,6 +28,12 @@ def family_p(g: Grams, sensors: Sequence[str], subset: Sequence[int] | None = No
     return Families(g, tuple(sensors)).p_value(range(g.count) if subset is None else subset)
 
 
+def by_long_blocks(sensors: Sequence[str]) -> bool:
+    """Whether the longest blocks are asked of a family whose coefficients are of these sensors (P,): only they protect
+    against noise that is correlated for longer than a thirtieth of a survey."""
+    return 3 * max(map(list(sensors).count, set(sensors))) <= BLOCK_COUNTS[-1]
+
+
 @dataclass(frozen=True)
 class Families:
     """Tests of families of coefficients in the same blocks.

@@ -15,7 +15,7 @@ from magtensor.calibration.nominal import Nominal
 from magtensor.calibration.types import Array
 from magtensor.components import Component
 from magtensor.error_models.excitation import Excitation
-from magtensor.error_models.settings import AnyChannel, Duration, Range, profiled
+from magtensor.error_models.settings import AnyChannel, Duration, EventTimes, Range, profiled
 from magtensor.error_models.station import Station
 from magtensor.error_models.terms import Terms, joined
 from magtensor.errors import UsageError
@@ -235,6 +235,14 @@ def unread(adopted: Sequence[Adopted], time: Array, station: Station | None = No
 
 
 CHANNEL = "channel_response"  # of a channel that nobody wrote a model for
+
+
+def of_time(component: Component) -> bool:
+    """Whether an effect drifts, warms up or happens once: a setting is a time of the survey, or a part of it."""
+    return any(
+        isinstance(grid, (Duration, EventTimes)) or (isinstance(grid, Range) and grid.of_duration)
+        for grid in profiled(component).values()
+    )
 
 
 def generic(model: Adopted) -> bool:

@@ -8,12 +8,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from magtensor.calibration.types import Array
+from magtensor.components import Component
+from magtensor.error_models.needs import FACTS
 from magtensor.error_models.settings import AnyChannel, profiled
 from magtensor.error_models.terms import Terms, joined
 from magtensor.loop.evidence.assessment import BORNE_OUT, Assessment
 from magtensor.loop.evidence.lone_event import MOST_LEFT
 from magtensor.loop.evidence.residual import Residual, taken_off
-from magtensor.loop.fitting.model import Adopted, State, turning
+from magtensor.loop.evidence.statistics import by_long_blocks
+from magtensor.loop.fitting.model import Adopted, State, of_time, turning
 from magtensor.loop.searching.contribution import a_tone, happens_once
 
 ALPHA = 0.005  # family-wise probability that a clean survey gets an adoption, before the second gate
@@ -109,19 +112,30 @@ class Candidate:
     def significant(self) -> bool:
         """Whether noise does not explain it, all that was tried considered.
 
-        By its p value alone. Or, because a dozen long blocks tell little of what is very unlikely, in noise of each
-        sensor's own spectrum, if the blocks bear it out: as a test of this model alone where it is added to the axes,
+        By its p value alone, if it is from long blocks too or nothing slow can be the cause. Or, because a dozen long
+        blocks tell little of what is very unlikely, in noise of each sensor's own spectrum, if the blocks bear it out:
+        as a test of this model alone where it is added to the axes,
         among all models where it turns with the field, for noise that turns with it (a mount that creeps) has no
         spectrum. The p value of what happens once is not from blocks, and of a tone that spectrum does not know that
         its strongest line was taken. Nor do blocks tell much of what switched once or twice: an event that noise does
         not explain, and that is a part of it, says that there is something.
         """
-        if self.adjusted_p < self.alpha or self.of_an_event:
+        if self.of_an_event or (self.adjusted_p < self.alpha and not self._of_slow_noise_that_turns):
             return True
         if not self._of_a_known_spectrum:
             return False
         by_blocks = self.assessment.p * self.tried if self.terms.adds_to_axes else self.adjusted_p
         return self.adjusted_own_p < self.alpha and by_blocks < BORNE_OUT
+
+    @property
+    def _of_slow_noise_that_turns(self) -> bool:
+        """Whether slow noise of the sensors may be taken for it: it turns with the field, which makes its squares and
+        products with what it turns slow, so many coefficients that only short blocks are asked of them, and noise
+        explains as much in the residual's own colour and in each sensor's own spectrum."""
+        turns = not self.terms.adds_to_axes or _of_the_field(self.model.component)
+        if not turns or happens_once(self.model) or by_long_blocks(self.terms.sensors):
+            return False
+        return min(self.adjusted_null_p, self.adjusted_own_p) >= self.alpha
 
     @property
     def _of_a_known_spectrum(self) -> bool:
@@ -203,6 +217,13 @@ class Candidate:
     def passes(self) -> bool:
         """Both gates."""
         return self.predicts and self.beyond_slow_noise
+
+
+def _of_the_field(component: Component) -> bool:
+    """Whether an effect follows the field that turns, and neither a channel nor time."""
+    channel = any(isinstance(grid, AnyChannel) for grid in profiled(component).values())
+    known = all(need in FACTS for need in component.declared({}).needs)
+    return known and not channel and not of_time(component)
 
 
 def gained_of_a_log(log_noise: float, coefficients: float) -> float:

@@ -10,7 +10,6 @@ does.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,10 +17,9 @@ from numpy.typing import NDArray
 from magtensor.calibration.types import Array
 from magtensor.error_models.excitation import Excitation
 from magtensor.error_models.needs import FACTS
-from magtensor.error_models.settings import Duration, EventTimes, Range, profiled
 from magtensor.error_models.terms import Terms
 from magtensor.loop.evidence.assessment import NEARLY_ALL, Assessment
-from magtensor.loop.fitting.model import Adopted, State, generic
+from magtensor.loop.fitting.model import Adopted, State, generic, of_time
 from magtensor.loop.searching.contribution import a_tone, happens_once, moments
 from magtensor.loop.searching.gates import Candidate, explained_by, seen_between
 
@@ -130,7 +128,7 @@ def _courses(model: Adopted, x: Excitation, samples: NDArray[np.int_]) -> Array:
 def drivers(model: Adopted, x: Excitation) -> set[str]:
     """The channels that a model follows, and `TIME` of what drifts, warms up or happens once."""
     found = model.channels(x) | {need for need in model.component.declared({}).needs if need in x.logged}
-    return found | ({TIME} if any(map(_of_time, profiled(model.component).values())) else set())
+    return found | ({TIME} if of_time(model.component) else set())
 
 
 def _of_one_moment(model: Adopted, other: Adopted, x: Excitation, apart: int = 0) -> bool:
@@ -172,11 +170,6 @@ def _of_the_field_alone(model: Adopted, x: Excitation) -> bool:
 def _of_a_gradient(model: Adopted) -> bool:
     """Whether a model acts only in a field that is not uniform: on what a field of the site is, and not beside it."""
     return "gradient" in model.component.declared({}).needs
-
-
-def _of_time(grid: Any) -> bool:
-    """A setting that times of the survey, or parts of it, are chosen for."""
-    return isinstance(grid, (Duration, EventTimes)) or (isinstance(grid, Range) and grid.of_duration)
 
 
 def _held_by(sensors: Sequence[str], state: State, terms: Terms, assessment: Assessment) -> float:

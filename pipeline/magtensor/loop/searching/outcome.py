@@ -214,6 +214,11 @@ def why(candidate: Candidate, winner: Candidate | None) -> str:
     if happens_once(candidate.model):
         p += " in noise of each sensor's own spectrum"
     figures = f"{p}, held-out gain {gain.total:.4g} (t {gain.t:.2g})"
+    if not candidate.significant and candidate.adjusted_p < candidate.alpha:
+        of_slow = min(candidate.adjusted_null_p, candidate.adjusted_own_p)
+        return (
+            f"not significant: by short blocks alone, {of_slow:.2g} in noise as slow as the residual's own: {figures}"
+        )
     if not candidate.significant:
         return f"not significant: {figures}"
     if candidate.of_the_log and candidate.log_noise > 0:

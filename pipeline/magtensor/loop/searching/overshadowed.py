@@ -30,6 +30,7 @@ from magtensor.error_models.settings import Frequencies, profiled
 from magtensor.error_models.terms import joined
 from magtensor.error_models.waveform import NAME
 from magtensor.loop.evidence.assessment import estimated
+from magtensor.loop.evidence.jumps import jumpiness
 from magtensor.loop.evidence.residual import taken_off
 from magtensor.loop.fitting.model import Adopted, State
 from magtensor.loop.fitting.refit import everywhere
@@ -52,6 +53,9 @@ ALONG = 0.95  # cosine, with a source's vector or another event's; of one sensor
 MUCH_OF_IT = 0.5  # of what an event explains, that is left out of the calibration
 FACTOR = 2.0  # of its size, that this may differ by: what is far larger is another thing
 AS_MUCH = 0.25  # of an event, that it may differ by from what it is at another time
+JUMPS = 2.5  # standard errors of the kurtosis, which steady noise has in less than one series of a hundred
+STANDS_OUT = 5.0  # times the rms of what goes in jumps: one of these has as much
+SLOW = 0.5  # of the white noise, that what goes in jumps has at least
 SIDEBANDS = 3  # tones along one vector, and no two of them harmonics of what is between them
 CLOSE = 1.5  # times the lowest of their frequencies; the second and third harmonic are as far apart
 HARMONICS = 16  # of the turning, that a law of the attitude with a corner shows
@@ -63,7 +67,7 @@ def overshadowed(found: Search, fixed: int) -> tuple[list[int], str] | None:
     state, left = found.told, staying(found)
     weakest: tuple[float, list[int], str] | None = None
     part = _of_an_adopted_source(state, fixed) or of_what_is_left_out(found, fixed) or _of_one_tone(state, fixed)
-    part = part or of_a_restless_station(found, fixed)
+    part = part or of_a_restless_station(found, fixed) or of_what_jumps(state, fixed)
     if part is not None:
         return part
     for places in _of_one_name(state, fixed):
@@ -154,8 +158,7 @@ def of_what_is_left_out(found: Search, fixed: int) -> tuple[list[int], str] | No
     are off by, and more than it explains, or by as much as it is: what it is a part of acts at other times too, by a
     law that has no name."""
     state = found.told
-    events = [i for i, a in enumerate(state.adopted) if i >= fixed and happens_once(a)]
-    known = [(i, v) for i in events if (v := _vector(state, i)) is not None]
+    known = _events(state, fixed)
     out = ~np.asarray(state.fit.keep)
     left = everywhere(found.record, state) if known and out.any() else None
     if left is None or left.across is None:
@@ -232,8 +235,7 @@ def _as_large(share: Array, samples: NDArray[np.int_], state: State, place: int)
 
 def _of_one_that_switches(state: State, fixed: int) -> tuple[list[int], str] | None:
     """Several offsets that came or went along one vector: something switches, perhaps more often than they tell."""
-    events = [(i, _vector(state, i)) for i, a in enumerate(state.adopted) if i >= fixed and happens_once(a)]
-    known = [(i, v) for i, v in events if v is not None]
+    known = _events(state, fixed)
     for _, first in known:
         places = [i for i, v in known if _along(v, first) or _along(first, v)]
         if len(places) > 1:
@@ -243,6 +245,27 @@ def _of_one_that_switches(state: State, fixed: int) -> tuple[list[int], str] | N
                 f"something in {', '.join(sensors)} switches along one vector more often than such events tell, or "
                 "goes on changing",
             )
+    return None
+
+
+def of_what_jumps(state: State, fixed: int) -> tuple[list[int], str] | None:
+    """Offsets that came or went, along whose vector what stays goes in jumps too, most of which are not much smaller:
+    popcorn noise, of which the law of steady noise says that so large a jump is unlikely."""
+    residual = state.residual
+    if residual.across is None:
+        return None
+    for place, model in enumerate(state.adopted):
+        vector = _vector(state, place) if place >= fixed and happens_once(model) else None
+        if vector is None:
+            continue
+        seen = vector / residual.noise @ residual.projector
+        size = float(np.linalg.norm(seen))
+        stays = residual.across @ seen / size if size > 0.0 else np.zeros(len(residual.across))
+        beyond = max(float(np.mean(stays**2)) - 1.0, 0.0) ** 0.5
+        if beyond > SLOW and size < STANDS_OUT * beyond and jumpiness(stays) > JUMPS:
+            places = [i for i, v in _events(state, fixed) if i == place or _along(v, vector) or _along(vector, v)]
+            amount = beyond / size * float(np.sqrt(np.mean(vector[vector != 0.0] ** 2)))
+            return places, f"what stays along its vector goes in jumps too, of {amount:.3g} nT rms"
     return None
 
 
@@ -290,6 +313,12 @@ def _vector(state: State, place: int) -> Array | None:
     raw = terms.part_output >= 0
     np.add.at(vector, terms.part_output[raw], terms.part_weight[raw] * state.theta[place][terms.part_term[raw]])
     return vector if vector.any() else None
+
+
+def _events(state: State, fixed: int) -> list[tuple[int, Array]]:
+    """The places of the adopted events that have one series, and their vectors (3 S,) nT."""
+    events = [(i, _vector(state, i)) for i, a in enumerate(state.adopted) if i >= fixed and happens_once(a)]
+    return [(i, v) for i, v in events if v is not None]
 
 
 def _along(one: NDArray[Any], other: NDArray[Any]) -> bool:

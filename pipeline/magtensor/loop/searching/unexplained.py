@@ -35,6 +35,7 @@ from magtensor.loop.remainder.jitter import jitter_words
 from magtensor.loop.remainder.limited_band import Band, limited_band
 from magtensor.loop.remainder.loud import Loud, louder_words
 from magtensor.loop.remainder.outlying import Outlying, outlying_words, spike_words
+from magtensor.loop.remainder.popcorn import popcorn_words
 from magtensor.loop.remainder.predictable import attitude_words, converter_words, shortened_words
 from magtensor.loop.remainder.sparse_readings import SparseReadings, sparse_readings
 from magtensor.loop.remainder.tones import channels_of_the_line, of_the_turning
@@ -72,7 +73,8 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
     suspects = Suspects.of(found, flagged, played, sparse, loud.stretches, _seen_alike(state.residual))
     outlying = Outlying.of(state, record)
     too_often, theirs = outlying_words(outlying, ~np.asarray(state.fit.keep))
-    words = [*_what_shows(found, record, excess, sparse), *suspects.words, *too_often]
+    shows = _what_shows(found, record, excess, sparse)
+    words = [*shows, *([] if shows else popcorn_words(state)), *suspects.words, *too_often]
     band = None if words else limited_band(state.residual)
     times = _slow(state, record) / state.residual.scale
     if not words and (times if band is None else band.slow) > NO_NOISE:
