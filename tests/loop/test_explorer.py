@@ -7,6 +7,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import pytest
 import yaml
@@ -405,8 +406,10 @@ def test_a_session_holds_its_verification_survey(
     tmp_path: Path, survey: Path, recipe: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    for name in ("verify.h5", "other.h5"):
+    for number, name in enumerate(("verify.h5", "other.h5"), start=1):  # a copy is refused
         (tmp_path / name).write_bytes(survey.read_bytes())
+        with h5py.File(tmp_path / name, "r+") as copy:
+            copy["b_raw"][...] += 0.01 * np.random.default_rng(number).standard_normal(copy["b_raw"].shape)
     options = ("--verify", "verify.h5")
     converse(monkeypatch, capsys, recipe, "reject current_field", options=options)
     first = tmp_path / "few.session-1.yaml"
