@@ -35,6 +35,17 @@ def test_a_channel_that_acts_in_a_part_of_the_survey_is_named_with_it(begins: bo
     assert followed_in_part(record.time, heater + 0.1 * rng.standard_normal(SAMPLES), record) == ""  # it acts always
 
 
+def test_few_switchings_are_enough_where_nothing_else_is_in_the_waveform() -> None:
+    rng = np.random.default_rng(4)
+    record = synthetic(1, SAMPLES)
+    pump = np.searchsorted([100, 210, 390, 500, 710, 800, 950, 1060], record.time) % 2 * 1.0
+    record = replace(record, logged={"rain": smooth(rng, 20.0), "pump": pump})
+    waveform = pump * (record.time > 600.0)
+    words = followed_in_part(record.time, waveform + 0.02 * rng.standard_normal(SAMPLES), record)
+    assert words.startswith("pump from ") and 500.0 < float(words.split()[2]) <= 710.0
+    assert followed_in_part(record.time, waveform + 0.2 * rng.standard_normal(SAMPLES), record) == ""
+
+
 @pytest.mark.parametrize("seed", range(20))
 def test_what_has_nothing_to_do_with_a_source_is_not_named(seed: int) -> None:
     rng = np.random.default_rng(100 + seed)

@@ -29,6 +29,8 @@ ONE_DIRECTION = 0.9  # of an effect's power
 PARTS = 50  # of the survey, between which what follows a channel may begin or end to
 MOST_OF_IT = 0.8  # of a waveform's square
 MUCH_LESS = 0.5  # of what the channel leaves of it all along
+NEARLY_ALL_OF_IT = 0.97  # the same, of one that has but some switchings in common with the channel
+SOME = 2.0  # switchings: another course has none of them at the same times
 FEW = 8.0  # independent values: any course with fewer is like some channel, through some power and lag
 REMEMBERS = 0.3  # of its size, what other samples change of a regressor that remembers the field there
 
@@ -152,7 +154,8 @@ def followed_in_part(time: Array, values: Array, record: Record) -> str:
                 share = 1.0 - left / whole
                 if share <= max(best, MOST_OF_IT) or left >= MUCH_LESS * always:
                     continue
-                if _comes_and_goes(course[acts]) and _comes_and_goes(values[acts]):
+                least = FEW if share < NEARLY_ALL_OF_IT else SOME
+                if _comes_and_goes(course[acts], least) and _comes_and_goes(values[acts], least):
                     best, words = share, f"{name} {when.format(time[edge] - record.time[0])}"
     return words
 
@@ -174,10 +177,10 @@ def followed_by_a_product(time: Array, values: Array, record: Record) -> str:
     return words
 
 
-def _comes_and_goes(course: Array) -> bool:
+def _comes_and_goes(course: Array, least: float) -> bool:
     """Whether a course crosses its mean so often that another one hardly does so at the same times."""
     above = course > course.mean()
-    return independent(course) > FEW and int(np.count_nonzero(above[1:] != above[:-1])) > FEW
+    return independent(course) > least and int(np.count_nonzero(above[1:] != above[:-1])) > least
 
 
 def _left_by(course: Array, values: Array) -> float:
