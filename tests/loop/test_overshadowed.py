@@ -20,7 +20,7 @@ from magtensor.loop.fitting.refit import joint_state
 from magtensor.loop.searching import latent, overshadowed, rounds, search
 from magtensor.loop.searching.contribution import borne_out, possible_without, without_models
 from magtensor.loop.searching.found import Search
-from magtensor.loop.searching.overshadowed import attitude_share, of_a_restless_station, of_what_is_left_out
+from magtensor.loop.searching.overshadowed import attitude_share, of_a_restless_station, of_nothing, of_what_is_left_out
 from magtensor.registry import Registry
 
 MODELS = ("nonlinearity_quadratic", "nonlinearity_cubic", "current_field", "site_gradient")
@@ -260,6 +260,18 @@ def test_a_step_along_whose_vector_more_is_left_out_is_a_part_of_that(along: boo
     assert (doubted is not None) is along
     if doubted is not None:
         assert doubted[0] == [0] and "299 samples" in doubted[1]
+
+
+@pytest.mark.parametrize("name", ["offset_step", "turn_step"])
+def test_a_step_before_which_nothing_is_in_use_tells_nothing(name: str) -> None:
+    record = synthetic(14)
+    model = Adopted(Registry.load().find("error_model", name), {"time_s": 300.5})
+    state = joint_state(record, [model], Fitting())
+    assert of_nothing(state, 0) is None
+    part = state.residual
+    late = replace(state, residual=replace(part, samples=part.samples[310:], affine=part.affine[310:]))
+    found = of_nothing(late, 0)
+    assert found is not None and found[0] == [0] and of_nothing(late, 1) is None
 
 
 @pytest.mark.parametrize("sensor", [1, 2])

@@ -56,6 +56,7 @@ AS_MUCH = 0.25  # of an event, that it may differ by from what it is at another 
 JUMPS = 2.5  # standard errors of the kurtosis, which steady noise has in less than one series of a hundred
 STANDS_OUT = 5.0  # times the rms of what goes in jumps: one of these has as much
 SLOW = 0.5  # of the white noise, that what goes in jumps has at least
+NOTHING = 1e-3  # of an event, that C and o leave
 SIDEBANDS = 3  # tones along one vector, and no two of them harmonics of what is between them
 CLOSE = 1.5  # times the lowest of their frequencies; the second and third harmonic are as far apart
 HARMONICS = 16  # of the turning, that a law of the attitude with a corner shows
@@ -66,7 +67,12 @@ def overshadowed(found: Search, fixed: int) -> tuple[list[int], str] | None:
     adopted, and why it is doubted."""
     state, left = found.told, staying(found)
     weakest: tuple[float, list[int], str] | None = None
-    part = _of_an_adopted_source(state, fixed) or of_what_is_left_out(found, fixed) or _of_one_tone(state, fixed)
+    part = (
+        of_nothing(state, fixed)
+        or _of_an_adopted_source(state, fixed)
+        or of_what_is_left_out(found, fixed)
+        or _of_one_tone(state, fixed)
+    )
     part = part or of_a_restless_station(found, fixed) or of_what_jumps(state, fixed)
     if part is not None:
         return part
@@ -139,6 +145,19 @@ def _of_what_wanders(found: Search, state: State, places: Sequence[int]) -> str:
         return ""
     more = [c.model.name for c in last if happens_once(c.model) and unlikely(c) and not c.passes]
     return f"is no lone event ({' and '.join(more)} beside it would predict nothing)" if more else ""
+
+
+def of_nothing(state: State, fixed: int) -> tuple[list[int], str] | None:
+    """An event on one side of which no sample has a part in the calibration any more: C and o do what it does."""
+    own = np.linalg.qr(state.residual.affine)[0]
+    for place, model in enumerate(state.adopted):
+        if place < fixed or not happens_once(model):
+            continue
+        series = model.terms(state.excitation).series[state.residual.samples]
+        left = series - own @ (own.T @ series)
+        if np.sum(left**2) < NOTHING**2 * np.sum(series**2):
+            return [place], "no sample on one side of it has a part in the calibration"
+    return None
 
 
 def _of_an_adopted_source(state: State, fixed: int) -> tuple[list[int], str] | None:
