@@ -16,6 +16,7 @@ from magtensor.survey.flags import Flag, flag_ranges
 from magtensor.survey.lone_readings import lone_readings
 from magtensor.survey.model import AXES, Survey
 from magtensor.units import TEMPERATURE, UNITS, convert
+from magtensor_stages.faults import refuse_faults
 
 BY = "load"
 _READ_TOGETHER = 0.5  # of the readings of the sensor that has the fewest
@@ -48,6 +49,9 @@ def load(
     copied_axes: Annotated[
         Literal["refuse", "accept"], Field(description="two axes that hold the same numbers")
     ] = "refuse",
+    copied_rows: Annotated[
+        Literal["refuse", "accept"], Field(description="a stretch whose readings are those of another stretch")
+    ] = "refuse",
     saturation_nT: Annotated[
         float | None, Field(gt=0, description="end of the sensors' range, nT; default: found from the data")
     ] = None,
@@ -57,11 +61,11 @@ def load(
 ) -> Survey:
     """Read the survey, check it, and flag the samples that cannot be used.
 
-    Refused: times that do not increase, an axis without signal, a sensor that is stuck, two axes with the same
-    numbers, magnitudes that betray wrong units, more flagged samples than allowed. Flagged: missing and infinite
-    values, saturation, runs in which a sensor repeats itself. No calibration is fitted to rows that repeat a reading or
-    lie on the line between two, in a recording faster than its sensors. Reported with the variables: sampling,
-    quantisation.
+    Refused: times that do not increase, an axis without signal, a sensor that is stuck, two axes or two stretches with
+    the same numbers, magnitudes that betray wrong units, more flagged samples than allowed. Flagged: missing and
+    infinite values, saturation, runs in which a sensor repeats itself. No calibration is fitted to rows that repeat a
+    reading or lie on the line between two, in a recording faster than its sensors. Reported with the variables:
+    sampling, quantisation.
     """
     if survey.source is None:
         raise UsageError("load: the recipe has no `survey` section, and no survey was named on the command line")
@@ -79,7 +83,7 @@ def load(
     found = _without_fill_values(found, notes)
     found = _without_lone_readings(found, notes)
     found, impossible = _without_impossible(found)
-    _refuse_faults(found, magnitude, copied_axes, where)
+    refuse_faults(found, magnitude == "refuse", copied_axes == "refuse", copied_rows == "refuse", where)
     _judge_position(found, magnitude, where, notes)
     if magnitude == "refuse":
         _refuse_cold(found, where)
@@ -216,67 +220,6 @@ def _only_window(survey: Survey, window_s: tuple[float, float], where: str) -> S
     cut = _rows(survey, keep)
     first, last = cut.time[0], cut.time[-1]
     return replace(cut, flags=tuple(f for f in cut.flags if f.stop >= first and f.start <= last))
-
-
-def _refuse_faults(survey: Survey, magnitude: str, copied_axes: str, where: str) -> None:
-    field = survey.values("b_raw")
-    names = survey.sensors
-    for s, name in enumerate(names):
-        here = f"{where}: sensor {name}"
-        for a, axis in enumerate(AXES):
-            if not np.isfinite(field[:, s, a]).any():
-                raise DataError(f"axis {axis} holds no number at all", where=here)
-        spread = np.nanmax(np.where(np.isfinite(field[:, s]), field[:, s], -np.inf), axis=0) - np.nanmin(
-            np.where(np.isfinite(field[:, s]), field[:, s], np.inf), axis=0
-        )
-        if (spread == 0).all():
-            raise DataError(
-                "the sensor is stuck: all its samples are the same", where=here,
-                hint="`load: {sensors: [...]}` can leave the sensor out",
-            )  # fmt: skip
-        for a in checks.dead_axes(field[:, s]):
-            raise DataError(
-                f"axis {AXES[a]} is dead: it is {field[:, s, a][np.isfinite(field[:, s, a])][0]:g} nT in every sample",
-                where=here,
-                hint="`load: {sensors: [...]}` can leave the sensor out",
-            )
-    if magnitude == "refuse":
-        _refuse_magnitude(survey, where)
-    if copied_axes == "refuse":
-        for s, a, other, b in checks.copies(field):
-            raise DataError(
-                f"{names[s]} {AXES[a]} and {names[other]} {AXES[b]} hold the same numbers in every sample",
-                where=f"{where}: b_raw",
-                hint="is one column mapped twice? `load: {copied_axes: accept}` lets it pass",
-            )
-    for s, a in checks.deaf_axes(field):
-        raise DataError(
-            f"axis {AXES[a]} is dead: it varies a hundred times less than any direction of the other sensors",
-            where=f"{where}: sensor {names[s]}",
-            hint="`load: {sensors: [...]}` can leave the sensor out",
-        )
-
-
-def _refuse_magnitude(survey: Survey, where: str) -> None:
-    accept = "`load: {magnitude: accept}` lets it pass"
-    medians = np.nanmedian(np.linalg.norm(survey.values("b_raw"), axis=2), axis=0)
-    for name, median in zip(survey.sensors, medians, strict=True):
-        suspicion = checks.unit_suspicion(float(median))
-        if suspicion:
-            hint = f"are its units right, and base values or offsets added? {accept}"
-            raise DataError(suspicion, where=f"{where}: sensor {name}", hint=hint)
-    if "reference/total_field" in survey:
-        reference = float(np.nanmedian(survey.values("reference/total_field")))
-        suspicion = checks.unit_suspicion(reference)
-        if suspicion:
-            raise DataError(suspicion, where=f"{where}: reference/total_field", hint=f"are its units right? {accept}")
-        for name, median in zip(survey.sensors, medians, strict=True):
-            if not 1 / checks.MARGIN <= median / reference <= checks.MARGIN:
-                raise DataError(
-                    f"the median magnitude is {median:.6g} nT, that of the reference {reference:.6g} nT",
-                    where=f"{where}: sensor {name}",
-                    hint=f"are the scale, the offset and the reference those of this survey? {accept}",
-                )
 
 
 def _without_fill_values(survey: Survey, notes: list[str]) -> Survey:

@@ -12,6 +12,7 @@ from survey_cases import array_variables
 
 from magtensor.errors import DataError, NotEnoughData, UsageError
 from magtensor.survey.model import Survey
+from magtensor.survey.repeated import written_twice
 from magtensor.survey.sections import SurveySection
 from magtensor.survey.source import Source
 from magtensor_stages import load
@@ -198,6 +199,29 @@ def test_an_axis_that_copies_another_is_not_called_dead(load_variables: Load, va
 
     with pytest.raises(DataError, match="S3 x and S3 y hold the same numbers in every sample"):
         load_variables(changed(variables, "b_raw", copied))
+
+
+def test_a_stretch_that_was_written_twice(load_variables: Load, variables: Variables) -> None:
+    """Its noise would be there twice, and every pattern in it would predict the other half."""
+
+    def again(b: Any) -> None:
+        b[300:380] = b[100:180]
+
+    spoilt = changed(variables, "b_raw", again)
+    with pytest.raises(DataError, match="samples 301 to 380 hold the same readings as samples 101 to 180"):
+        load_variables(spoilt)
+    assert load_variables(spoilt, copied_rows="accept").good.all()
+
+
+def test_a_sensor_that_rests_or_comes_back_repeats_no_sequence(load_variables: Load, variables: Variables) -> None:
+    """Coarse steps and three postures: rows that are alike, in no order."""
+    rng = np.random.default_rng(6)
+    postures = 30e3 * rng.standard_normal((3, 4, 3)) / np.sqrt(3.0)
+
+    def coarse(b: Any) -> None:
+        b[...] = np.round((postures[np.arange(len(b)) // 50 % 3] + 2.0 * rng.standard_normal(b.shape)) / 5.0) * 5.0
+
+    assert written_twice(changed(variables, "b_raw", coarse)["b_raw"][1]) is None
 
 
 def test_a_planar_rotation_is_no_dead_axis(load_variables: Load, variables: Variables) -> None:

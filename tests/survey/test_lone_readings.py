@@ -99,3 +99,16 @@ def during(values: Array, first: int, last: int, value: float) -> Array:
 )
 def test_a_course_that_is_none(make: Callable[[], Array]) -> None:
     assert not lone_readings(make()).any()
+
+
+def test_the_top_of_a_pulse_is_not_alone() -> None:
+    """A magnetorquer's, smooth; of the highest one two readings are beyond all others."""
+    rows = np.arange(ROWS)
+    each = [np.exp(-0.5 * ((rows - at) / 25.0) ** 2) for at in range(300, ROWS, 400)]
+    values: Array = np.sum(each, axis=0)
+    low, high = np.quantile(values, [0.02, 0.98])
+    highest = np.array([0.85, 0.92, 0.97, 1.01, 1.01, 0.97, 0.92, 0.85])
+    values[2947:2955] = highest * (high + (high - low))
+    assert not lone_readings(values).any()
+    values[2950:2952] *= 2.0
+    assert np.flatnonzero(lone_readings(values)).tolist() == [2950, 2951]

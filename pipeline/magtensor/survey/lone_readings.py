@@ -15,6 +15,7 @@ from magtensor.survey.recorded_numbers import Bools, Floats, runs
 INNER = 0.02  # of the rows at either end of what a log holds, beyond the usual
 MOST = 0.02  # of the rows: what comes more often is no mistake of reading
 OUTSIDE = 1.0  # times the width of the inner readings, beyond these
+NEIGHBOURS = 0.5  # of that, from the readings before and after
 LONGEST = 2  # times as many rows as the others usually keep a value for: what lasts longer is no mistake of reading
 LEAST_ROWS = 50
 STEADY = 0.5  # mean square of the changes over that of white noise: a log has a course that a reading can depart from
@@ -53,9 +54,16 @@ def _of_one(values: Floats, slow: bool) -> Bools:
         return out
     longest = len(read) if slow else LONGEST * _usual_run(others)
     for a, b in in_a_row(far):
-        if a > 0 and b < len(read) and b - a <= longest:
+        if a > 0 and b < len(read) and b - a <= longest and _alone(read[a - 1 : b + 1], margin):
             out[known[a:b]] = True
     return out
+
+
+def _alone(values: Floats, margin: float) -> bool:
+    """Whether values but for the first and last are far from these two: the top of a pulse has neighbours nearly as
+    high."""
+    inner, around = values[1:-1], values[[0, -1]]
+    return float(np.abs(inner[:, None] - around).min()) > NEIGHBOURS * margin
 
 
 def _usual_run(values: Floats) -> float:

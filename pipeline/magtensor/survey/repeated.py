@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from magtensor.in_a_row import in_a_row
 from magtensor.survey.recorded_numbers import Bools, Floats, believable_run, noise, resolution, runs, span
 
 # of the largest number: rounding of interpolated values that are stored in four bytes or in eight
@@ -14,6 +15,8 @@ NEARLY_ALL = 0.8  # of the rows that are alike on all axes
 LEAST_CHANGES, LEAST_HELD_ROWS = 5, 2.5  # of a series that repeats its readings; rows from one to the next
 LEAST_STUCK = 2.0  # rows alike on all axes that are no fault, whatever other sensors do meanwhile
 UNLIKELY_GRID = 1e-8  # that the changes of other series lie on a regular grid
+LEAST_SEQUENCE = 50  # different rows one after the other
+LAGS = 5  # between two rows that are alike, that are looked at: the most frequent
 LEAST_SEVERAL = 0.2  # of the changes, by more than one of the smallest steps
 
 
@@ -180,6 +183,30 @@ def _at_once(together: float, each: Floats) -> float:
         beyond = (together - h) * (1.0 - h) ** (len(each) - 1) > np.prod(each - h)
         low, high = (h, high) if beyond else (low, h)
     return low
+
+
+def written_twice(field: Floats) -> tuple[int, int, int] | None:
+    """The first row of a stretch, that of another one with the same readings, and their length; None where no noise
+    comes twice. A sensor that rests repeats a row, and no sequence of them.
+
+    Args:
+        field: (N, S, 3) nT.
+    """
+    rows = np.ascontiguousarray(field.reshape(len(field), -1), dtype=np.float64)
+    known = np.flatnonzero(np.isfinite(rows).all(axis=1))
+    odd = np.random.default_rng(0).integers(0, 2**62, rows.shape[1], dtype=np.uint64) * np.uint64(2) + np.uint64(1)
+    mixed = (rows[known].view(np.uint64) * odd).sum(axis=1, dtype=np.uint64)
+    order = np.argsort(mixed, kind="stable")
+    same = mixed[order[1:]] == mixed[order[:-1]]
+    apart, often = np.unique((order[1:] - order[:-1])[same], return_counts=True)
+    for lag in apart[np.argsort(-often)][:LAGS]:
+        equal = mixed[lag:] == mixed[:-lag]
+        for start, stop in in_a_row(equal):
+            if len(np.unique(mixed[start:stop])) >= LEAST_SEQUENCE and np.array_equal(
+                rows[known[start:stop]], rows[known[start + lag : stop + lag]]
+            ):
+                return int(known[start]), int(known[start + lag]), int(stop - start)
+    return None
 
 
 def held_readings(time: Floats, values: Floats) -> tuple[Bools, float] | None:
