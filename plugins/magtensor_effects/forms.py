@@ -32,7 +32,10 @@ OfField = Annotated[
     Field(description="true: acts on what the axis makes of the field; false: on its whole output, offset and all"),
 ]
 
-BENDS = Field(description="values of the channel at which the response bends, straight in between; none: by its powers")
+BENDS = Field(
+    description="values of the channel, less its mean over the calibration survey unless it is a current, at which the "
+    "response bends, straight in between; none: by its powers"
+)
 
 Bent = Annotated[tuple[float, ...], Bends(), BENDS]
 BentPower = Annotated[tuple[float, ...], Bends(instead=("power", "lower_powers")), BENDS]

@@ -8,7 +8,13 @@ import numpy as np
 import pytest
 from loop_cases import Array, synthetic
 
-from magtensor.loop.searching.likeness import _correlations, followed, followed_by_a_product, followed_in_part
+from magtensor.loop.searching.likeness import (
+    _correlations,
+    course_words,
+    followed,
+    followed_by_a_product,
+    followed_in_part,
+)
 
 SAMPLES = 1200
 
@@ -89,3 +95,14 @@ def test_correlations_are_those_of_what_two_series_have_in_common() -> None:
         later, sooner = max(shift, 0), max(-shift, 0)
         assert c == pytest.approx(np.corrcoef(late[later : 300 - sooner], early[sooner : 300 - later])[0, 1], abs=1e-9)
     assert _correlations(late, np.full(300, 2.0), shifts).tolist() == [0.0] * 5
+
+
+def test_when_a_source_acts_is_said() -> None:
+    elapsed = np.arange(1000) / 2.0
+    assert course_words(elapsed, np.where(elapsed > 120.0, 1.0, -0.3)) == "switches at 120.5 s"
+    thrice = np.searchsorted([40.25, 100.25, 300.25], elapsed) % 2 * 1.0
+    assert course_words(elapsed, thrice) == "switches 3 times, first at 40.5 s and last at 300.5 s"
+    for_a_while = np.where((elapsed > 200.0) & (elapsed < 300.0), np.sin(elapsed), 0.0)
+    found = course_words(elapsed, for_a_while).split()
+    assert found[:2] == ["acts", "from"] and 200.0 < float(found[2]) < 206.0 and 294.0 < float(found[4]) < 300.0
+    assert course_words(elapsed, np.sin(elapsed)) == "" == course_words(elapsed, np.zeros(1000))

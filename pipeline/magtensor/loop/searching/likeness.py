@@ -29,6 +29,8 @@ ONE_DIRECTION = 0.9  # of an effect's power
 PARTS = 50  # of the survey, between which what follows a channel may begin or end to
 MOST_OF_IT = 0.8  # of a waveform's square
 MUCH_LESS = 0.5  # of what the channel leaves of it all along
+WITHIN = 0.95  # of a waveform's square
+FOR_A_WHILE = 0.5  # of the survey
 NEARLY_ALL_OF_IT = 0.97  # the same, of one that has but some switchings in common with the channel
 SOME = 2.0  # switchings: another course has none of them at the same times
 FEW = 8.0  # independent values: any course with fewer is like some channel, through some power and lag
@@ -175,6 +177,30 @@ def followed_by_a_product(time: Array, values: Array, record: Record) -> str:
         if left < least and left < MUCH_LESS * float(held_out_losses(values, both, edges).sum()):
             least, words = left, f"{one} times {other}"
     return words
+
+
+def course_words(elapsed: Array, values: Array) -> str:
+    """When a waveform does what it does, in words: its switchings, or the part of a survey that it acts in; "" of what
+    acts all along.
+
+    Parameters
+    ----------
+    elapsed: (N,) s after the start; values: (N,).
+    """
+    switched = np.flatnonzero(np.diff(values))
+    if len(np.unique(values)) == 2:
+        first, last = elapsed[switched[0] + 1], elapsed[switched[-1] + 1]
+        if len(switched) == 1:
+            return f"switches at {first:.4g} s"
+        return f"switches {len(switched)} times, first at {first:.4g} s and last at {last:.4g} s"
+    power = np.cumsum((values - np.median(values)) ** 2)
+    if not len(power) or power[-1] <= 0.0:
+        return ""
+    begins, ends = np.searchsorted(power, np.array([0.5 - WITHIN / 2.0, 0.5 + WITHIN / 2.0]) * power[-1])
+    lasts = elapsed[min(ends, len(elapsed) - 1)] - elapsed[begins]
+    if lasts > FOR_A_WHILE * (elapsed[-1] - elapsed[0]):
+        return ""
+    return f"acts from {elapsed[begins]:.4g} to {elapsed[min(ends, len(elapsed) - 1)]:.4g} s"
 
 
 def _comes_and_goes(course: Array, least: float) -> bool:

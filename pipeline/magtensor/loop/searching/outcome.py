@@ -18,7 +18,7 @@ from magtensor.loop.searching.beginnings import lags
 from magtensor.loop.searching.contribution import happens_once
 from magtensor.loop.searching.found import Search, Step, without_and_with
 from magtensor.loop.searching.gates import Candidate
-from magtensor.loop.searching.likeness import followed_by_a_product, followed_in_part
+from magtensor.loop.searching.likeness import course_words, followed_by_a_product, followed_in_part
 from magtensor.loop.searching.on_fewer_sensors import named
 
 AS_FAST = 0.15  # of a time constant
@@ -115,6 +115,8 @@ def _adopted(found: Search, record: Record, index: int) -> dict[str, Any]:
     hidden = model.name == NAME and record.waveform is not None
     if hidden and (course := _course_of(np.asarray(record.waveform), record)):
         means, like = means or course, ""
+    elif hidden:
+        means = means or _told_of_a_source(state, index, record, like)
     return {
         "error_model": model.name,
         "kind": model.component.effect,
@@ -130,6 +132,15 @@ def _adopted(found: Search, record: Record, index: int) -> dict[str, Any]:
         **({"means": means} if means else {}),
         **({"most_like_channel": like} if like else {}),
     }
+
+
+def _told_of_a_source(state: State, index: int, record: Record, like: str) -> str:
+    """Where a source that nobody logged acts most, when, and that it is like no channel, in words."""
+    waveform = np.asarray(record.waveform)
+    each = np.linalg.norm(state.theta[index].reshape(-1, 3), axis=1) * float(np.std(waveform))
+    most = int(np.argmax(each))
+    words = [f"{each[most]:.3g} nT rms on {record.sensors[most]}", course_words(record.time - record.start, waveform)]
+    return ", ".join([word for word in words if word] + ([] if like else ["like no logged channel"]))
 
 
 def _course_of(waveform: Array, record: Record) -> str:
