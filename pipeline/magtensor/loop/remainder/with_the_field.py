@@ -21,7 +21,7 @@ LEAST_PER_BLOCK = 30
 LEAST_SHARE = 0.25  # of the power of what is left of the sensor: laws of what is adopted leave less
 ALIKE = 0.4  # of the worst sensor's, in each other: of three, one alone makes a quarter of it
 CLEARLY = 1.3  # times the share of an earlier law: one gain of a sensor is three alike as well
-EVERY, EACH_AXIS = np.ones((3, 3)), np.eye(3)
+EVERY, EACH_AXIS = np.array([1.0, 1.0, 1.0, 2.0, 2.0, 2.0]), np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
 GAIN = "what it reads, as if its gain changed by {} rms, which follows no channel"
 GAINS = "what each axis reads, as if its gain changed by {} rms, which follows no channel"
 STAMPS = "how fast the field turns in it, as if its stamps were off by {} rms, now early and now late"
@@ -29,13 +29,13 @@ STAMPS = "how fast the field turns in it, as if its stamps were off by {} rms, n
 
 @dataclass(frozen=True)
 class _Law:
-    """What is left of a sensor as a part of a vector (N, 3), in its noise: the squares and products that follow."""
+    """What is left of a sensor as a part of a vector, and which squares and products of axes follow then."""
 
     words: str
     unit: str
     size: float
     vector: Array  # (N, S, 3), over the noise
-    products: Array  # (3, 3), of those that are asked
+    weights: Array  # (6,) of the squares, and of the products, each of which is there twice
 
 
 @dataclass(frozen=True)
@@ -88,23 +88,29 @@ def _along(left: Array, law: _Law) -> _Found:
 
     Judged are directions, nothing being louder than usual, by contiguous blocks; the amount is that of the whole.
     """
-    own, by = (_centred(_soft(v), law.products)[0] for v in (left, law.vector))
-    each = np.array([part.sum(axis=0) for part in np.array_split(np.sum(own * by, axis=(2, 3)), BLOCKS)])
-    t = each.mean(axis=0) / np.maximum(each.std(axis=0, ddof=1) / np.sqrt(BLOCKS), 1e-300)
-    (own, power), (by, size) = (_centred(v, law.products) for v in (left, law.vector))
-    part = np.sum(own * by, axis=(0, 2, 3)) / np.maximum(np.sum(by**2, axis=(0, 2, 3)), 1e-300)
-    return _Found(t, part * size / np.maximum(power, 1e-300), np.maximum(part, 0.0))
+    each = [_along_one(left[:, s], law.vector[:, s], law.weights) for s in range(left.shape[1])]
+    t, share, part = np.transpose(each)
+    return _Found(t, share, np.maximum(part, 0.0))
+
+
+def _along_one(left: Array, vector: Array, weights: Array) -> tuple[float, float, float]:
+    """The same of one sensor (N, 3): t, the share of its power, and the mean square as a part of the vector."""
+    own, by = (_products(_soft(v)) for v in (left, vector))
+    each = np.array([part.sum() for part in np.array_split((own * by) @ weights, BLOCKS)])
+    t = each.mean() / max(float(each.std(ddof=1)) / np.sqrt(BLOCKS), 1e-300)
+    own, by = _products(left), _products(vector)
+    part = float(np.sum((own * by) @ weights) / max(float(np.sum(by**2 @ weights)), 1e-300))
+    return float(t), part * float(np.mean(vector**2) / max(float(np.mean(left**2)), 1e-300)), part
 
 
 def _soft(vectors: Array) -> Array:
-    """(N, S, 3), none longer than one: half as long as that where they are of their usual size."""
-    square = np.sum(vectors**2, axis=2, keepdims=True)
-    out: Array = vectors / np.sqrt(np.maximum(square + np.median(square, axis=0), 1e-300))
+    """(N, 3), none longer than one: half as long as that where they are of their usual size."""
+    square = np.sum(vectors**2, axis=1, keepdims=True)
+    out: Array = vectors / np.sqrt(np.maximum(square + np.median(square), 1e-300))
     return out
 
 
-def _centred(vectors: Array, products: Array) -> tuple[Array, Array]:
-    """(N, S, 3, 3) the products of the axes that are asked, less their means; (S,) the mean square of the vectors."""
-    square = vectors[..., :, None] * vectors[..., None, :] * products
-    mean = square.mean(axis=0)
-    return square - mean, np.trace(mean, axis1=1, axis2=2)
+def _products(vectors: Array) -> Array:
+    """(N, 6) the squares of the axes (N, 3), and the products of each with the next, less their means."""
+    out = np.hstack([vectors**2, vectors * np.roll(vectors, -1, axis=1)])
+    return np.asarray(out - out.mean(axis=0))
