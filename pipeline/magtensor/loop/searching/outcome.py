@@ -136,10 +136,11 @@ def _adopted(found: Search, record: Record, index: int) -> dict[str, Any]:
 
 def _told_of_a_source(state: State, index: int, record: Record, like: str) -> str:
     """Where a source that nobody logged acts most, when, and that it is like no channel, in words."""
-    waveform = np.asarray(record.waveform)
-    each = np.linalg.norm(state.theta[index].reshape(-1, 3), axis=1) * float(np.std(waveform))
-    most = int(np.argmax(each))
-    words = [f"{each[most]:.3g} nT rms on {record.sensors[most]}", course_words(record.time - record.start, waveform)]
+    waveform, theta = np.asarray(record.waveform), state.theta[index]
+    owners = np.array(state.adopted[index].terms(state.excitation).sensors)
+    each = {str(s): float(np.linalg.norm(theta[owners == s]) * np.std(waveform)) for s in dict.fromkeys(owners)}
+    most = max(each, key=lambda s: each[s])
+    words = [f"{each[most]:.3g} nT rms on {most}", course_words(record.time - record.start, waveform)]
     return ", ".join([word for word in words if word] + ([] if like else ["like no logged channel"]))
 
 
