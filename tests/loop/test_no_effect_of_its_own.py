@@ -156,7 +156,7 @@ def telegraph(seed: int, time: Array, dwell_s: float) -> Array:
 @pytest.mark.parametrize(
     ("survey", "seed", "dwell_s", "size", "models", "words"),
     [
-        (96, 7, 40.0, 0.3, ["offset_while", "turn_step"], "no lone event"),
+        (96, 7, 40.0, 0.3, ["offset_while", "turn_step"], "what stays along its vector goes in jumps too"),
         (94, 5, 90.0, 1.0, ["offset_while", "offset_step"], "it acts at other times too"),
     ],
     ids=["one is found", "several are found"],

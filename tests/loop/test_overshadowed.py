@@ -262,6 +262,28 @@ def test_a_step_along_whose_vector_more_is_left_out_is_a_part_of_that(along: boo
         assert doubted[0] == [0] and "299 samples" in doubted[1]
 
 
+@pytest.mark.parametrize(
+    ("name", "passes", "p"),
+    [
+        ("offset_while", False, 0.0),
+        ("offset_while", True, 0.0),
+        ("offset_while", False, 0.1),
+        ("scale_drift", False, 0.0),
+    ],
+)
+def test_more_of_the_kind_that_predicts_nothing_makes_an_event_no_lone_one(name: str, passes: bool, p: float) -> None:
+    registry = Registry.load()
+    adopted = Adopted(registry.find("error_model", name), {"time_s": 100.0, "until_s": 200.0})
+    step = Adopted(registry.find("error_model", "offset_step"), {"time_s": 700.0})
+    beside: Any = SimpleNamespace(
+        model=step, passes=passes, adjusted_p=p, adjusted_own_p=p, adjusted_null_p=p, alpha=0.005
+    )
+    found: Any = SimpleNamespace(steps=(SimpleNamespace(candidates=(beside,)),))
+    state: Any = SimpleNamespace(adopted=(adopted,))
+    told = overshadowed._of_what_wanders(found, state, [0])
+    assert ("no lone event (offset_step beside it" in told) is (name == "offset_while" and not passes and p == 0.0)
+
+
 @pytest.mark.parametrize("name", ["offset_step", "turn_step"])
 def test_a_step_before_which_nothing_is_in_use_tells_nothing(name: str) -> None:
     record = synthetic(14)
