@@ -59,6 +59,18 @@ def test_one_of_many_jumps_is_no_event(seed: int, size: float) -> None:
     assert found.last.adopted == ()
 
 
+@pytest.mark.long
+def test_how_often_one_of_many_jumps_is_taken_for_an_event() -> None:
+    """Surveys that no threshold was chosen by: half of them had an event without the suspicion."""
+    model, taken = Registry.load().find("error_model", "offset_while"), 0
+    for seed in range(20, 40):
+        added = np.zeros((1200, 4, 3))
+        added[:, 0, 1] = 2.0 * levels(np.random.default_rng(3000 + seed), 1200, 60.0)
+        record = synthetic(seed, added=added, turning_s=4.0)
+        taken += len(search.search(record, [model], Fitting()).last.adopted) > 0
+    assert taken <= 5
+
+
 @pytest.mark.parametrize("seed", [0, 1, 2, 4])
 def test_an_event_in_steady_noise_stays_one(seed: int) -> None:
     """Slow noise of a sensor as strong as its white noise, and an offset for a while that no such noise has."""
