@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from effect_cases import Array, excitation, simulated
 
+from magtensor.error_models import rates
 from magtensor.error_models.excitation import Excitation
 
 
@@ -88,3 +89,23 @@ def test_the_matrix_of_a_field_in_a_plane_is_found_as_far_as_it_shows() -> None:
     found = replace(x, field=flat, output=output).matrix
     np.testing.assert_allclose(found[:, :, :2], survey.truth.matrix[:, :, :2], atol=1e-9)
     np.testing.assert_allclose(found[:, :, 2], np.broadcast_to([0.0, 0.0, 1.0], (4, 3)), atol=1e-9)
+
+
+@pytest.mark.parametrize("step", [0.05, 0.4])
+def test_the_second_derivative_of_a_turn(step: float) -> None:
+    """-w^2 of what turns at w. The noise is that of second differences of six samples' reach where the field turns a
+    quarter of a radian meanwhile, 1.5 times that near the ends, and of two where it turns by more."""
+    t = np.arange(400) * step
+    w, size, noise = 0.8, 5e4, 1.0
+    turned = size * np.stack([np.cos(w * t), np.sin(w * t), 0.5 + 0.0 * t], axis=1)
+    runs = [(0, 150), (150, 400)]
+    rate = rates.turning(t, runs, turned)
+    exact = turned * [-(w**2), -(w**2), 0.0]
+    inner = np.r_[10:140, 160:390]
+    # off by (w h)^2 / 12 over the reach h
+    h = 6 * 0.05 if step == 0.05 else 2 * step
+    found = rates.curvature(t, runs, turned, rate)
+    assert np.abs(found - exact)[inner].max() <= 1.05 * w**2 * size * (w * h) ** 2 / 12.0
+    noisy = turned + np.random.default_rng(3).normal(scale=noise, size=turned.shape)
+    across = (rates.curvature(t, runs, noisy, rates.turning(t, runs, noisy)) - found)[inner, 2]
+    assert np.std(across) < 1.2 * np.sqrt(6.0) * noise / h**2

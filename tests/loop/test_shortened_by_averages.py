@@ -116,3 +116,16 @@ def test_the_next_order_of_a_long_mean_is_no_error_of_the_base_station(tmp_path:
     assert [a["error_model"] for a in told["adopted"]] == ["averaging"]
     words = told["unexplained"]["description"]
     assert "of what averaging makes of it, whose law may leave as much" in words and "base station" not in words
+
+
+def test_means_over_many_rows_are_taken_off(tmp_path: Path) -> None:
+    """A file smoothed over 15 rows: second differences of neighbours, times the spread, would make more of their noise
+    each time they are taken off. What the next order leaves is 3 T^4 / 5760 of the fourth rate of change."""
+    hand = {"type": "tumbling", "duration_s": 150.0, "rate_rms_deg_s": 30.0, "rate_time_s": 5.0}
+    mean = {"type": "averaging", "spread_s2": [0.75**2 / 24.0] * 4}
+    found = magtensor.close_loop(survey_file(tmp_path, scenario(62, mean, rate_Hz=20.0, motion=hand)), search=TURNS)
+    assert [a["error_model"] for a in found.verdict["adopted"]] == ["averaging"]
+    assert found.verdict["adopted"][0]["coefficients"][0]["value"] == pytest.approx(0.75**2 / 24.0, rel=0.05)
+    held_out = found.verdict["error"]["held_out"]
+    before, after = (held_out[when]["total_field_rms_nT"]["all"] for when in ("before", "after"))
+    assert before > 100.0 and after < 0.03 * before

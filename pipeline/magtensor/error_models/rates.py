@@ -16,6 +16,7 @@ Runs = Sequence[tuple[int, int]]  # (first, one past last) sample of each
 SPLINED = 6  # samples, the fewest whose rate of change is that of a spline
 LARGEST_TURN = 0.5  # rad between neighbouring samples above which rates of change mean nothing
 LEAST_IN_A_RUN = 2 * SPLINED - 1  # samples that show a rate of change, and every second of them whether it is right
+LITTLE_TURN = 0.25  # rad: over which a second difference is off by half a per cent
 WORST_RATE = 0.5  # of the rate of change, moved by leaving out every second sample; with all of them the error of a
 # difference formula is then some tenths of that, where the attitudes are unrelated all of it and more
 
@@ -63,25 +64,40 @@ def turning(time: Array, runs: Runs, vectors: Array) -> Array:
 def curvature(time: Array, runs: Runs, vectors: Array, rate: Array) -> Array:
     """d2/dt2 of vectors (N, ..., 3) that turn, 1/s2, their rate being known.
 
-    Across them from differences over two samples to either side, in which noise is a quarter of that between
-    neighbours; along them what turning makes of a length that changes slowly, minus the squared rate over the length.
-    Zero in runs of fewer than five samples; the two at each end have that of the third.
+    Across them from differences over two samples to either side, or as many as the field turns a little over, and fewer
+    near the ends of a run: their noise falls with the square of that time, and what is found so can be taken off a
+    survey whose rows are means of many samples, where the closest differences would make more of their noise each time
+    it is done. Along them what turning makes of a length that changes slowly, minus the squared rate over the
+    length. Zero in runs of fewer than five samples; those at either end that have no difference have the next one.
     """
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     along = vectors / length
     change = np.zeros_like(vectors)
+    typical = _where_it_turns(np.linalg.norm(rate / length, axis=-1).ravel())
     for first, end in runs:
         if end - first < 5:
             continue
-        inner = change[first + 2 : end - 2]
         t, v = time[first:end], vectors[first:end]
+        slow = int(LITTLE_TURN / max(typical * float(np.median(np.diff(t))), 1e-9))
+        most = min(max(slow, 2), (len(t) - 1) // 2)
+        least = max(2, (2 * most + 2) // 3)
+        middle = np.arange(least, len(t) - least)
+        reach = np.minimum(np.minimum(middle, len(t) - 1 - middle), most)
         shape = (-1, *[1] * (vectors.ndim - 1))
-        before, after = (t[2:-2] - t[:-4]).reshape(shape), (t[4:] - t[2:-2]).reshape(shape)
-        inner[...] = 2.0 * ((v[4:] - v[2:-2]) / after - (v[2:-2] - v[:-4]) / before) / (before + after)
-        change[first : first + 2], change[end - 2 : end] = inner[0], inner[-1]
+        before, after = (t[middle] - t[middle - reach]).reshape(shape), (t[middle + reach] - t[middle]).reshape(shape)
+        rise, fall = (v[middle + reach] - v[middle]) / after, (v[middle] - v[middle - reach]) / before
+        inner = 2.0 * (rise - fall) / (before + after)
+        change[first:end] = inner[np.clip(np.arange(len(t)) - least, 0, len(inner) - 1)]
     own = np.sum(along * change, axis=-1, keepdims=True)
     out: Array = change - along * (own + np.sum(rate**2, axis=-1, keepdims=True) / length)
     return out
+
+
+def _where_it_turns(turns: Array) -> float:
+    """rad/s: the rate of turn (N,) at which half of the squares of all are larger, and half smaller."""
+    ordered = np.sort(turns)
+    below = np.cumsum(ordered**2)
+    return float(ordered[np.searchsorted(below, below[-1] / 2.0)])
 
 
 def with_turning_points(time: Array, runs: Runs, series: Array, rate: Array) -> Array:
