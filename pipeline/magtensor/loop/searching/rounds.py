@@ -14,6 +14,7 @@ from magtensor.loop.fitting.refit import settled
 from magtensor.loop.fitting.trial import Trial, on_the_folds_of, trial
 from magtensor.loop.remainder.predictable import by_what_they_read
 from magtensor.loop.remainder.tones import channels_of_the_line, tones
+from magtensor.loop.searching.another_lag import with_another_lag
 from magtensor.loop.searching.any_law import OUTPUTS, by_a_curve, by_any_law, by_any_law_of, outdone_by
 from magtensor.loop.searching.beside_a_hole import of_a_hole
 from magtensor.loop.searching.contribution import eliminate, tones_of, without_models
@@ -163,6 +164,8 @@ class Rounds:
                     state, steps = standing.state, [*steps, *more]
                 continue
             instead = None if asked else exchanged(record, state, steps, how, self.fixed, open_)
+            if instead is None and not asked:
+                instead = with_another_lag(record, state, how, self.fixed, open_, self.alpha)
             asked = True
             if instead is not None:
                 after, step = instead
