@@ -152,6 +152,7 @@ def clock_drift(x: Excitation) -> Terms:
 
 @error_model(
     "instrument",
+    needs=("turning",),
     source="Debye relaxation of the magnetisation",
     typical="some 100 ppm of the field beside steel; rarely known",
 )

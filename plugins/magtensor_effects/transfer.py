@@ -9,7 +9,7 @@ from magtensor.calibration.types import Array
 from magtensor.components import error_model
 from magtensor.error_models.curves import along_a_curve
 from magtensor.error_models.excitation import Excitation
-from magtensor.error_models.settings import Orders, Range
+from magtensor.error_models.settings import Orders, Plays
 from magtensor.error_models.terms import Terms, joined
 from magtensor_effects.forms import BentOutput, OfField
 
@@ -77,14 +77,17 @@ def cross_field(x: Excitation) -> Terms:
 
 
 @error_model(
-    "instrument", source="play operator of Prandtl and Ishlinskii", typical="below 2 nT after twice the full scale"
+    "instrument",
+    needs=("turning",),
+    source="play operator of Prandtl and Ishlinskii",
+    typical="below 2 nT after twice the full scale",
 )
 def hysteresis(
     x: Excitation,
     *,
     half_width_nT: Annotated[
         float,
-        Range(300.0, 30000.0, count=6, spacing="log"),
+        Plays(300.0, 30000.0, count=6, spacing="log"),
         Field(gt=0, description="half width of the play: how far the field turns back before the output follows, nT"),
     ] = 5000.0,
     of_iron: Annotated[

@@ -370,6 +370,12 @@ class Excitation(Acting):
         return rates.rate_known(self.time, self.runs(), self.field[:, 0])
 
     @property
+    def swept(self) -> float:
+        """rad, the rms angle between the field and its mean direction in the platform."""
+        directions = self.field[:, 0] / np.linalg.norm(self.field[:, 0], axis=1, keepdims=True)
+        return float(np.sqrt(max(1.0 - float(np.sum(directions.mean(axis=0) ** 2)), 0.0)))
+
+    @property
     def turns_unseen(self) -> bool:
         """Whether there are runs long enough to tell how the field turns, and it does so too fast, or not at all."""
         return not self.turns and max(b - a for a, b in self.runs()) >= rates.LEAST_IN_A_RUN

@@ -1,10 +1,11 @@
 """Whether a survey has what an error model needs.
 
 A need is the name of a channel (`acceleration`, `current_*`), a fact of the survey (`attitude`, `position`,
-`total_field`, `base_station`, `rotation`, `gradient`, `travel`, `waveform`), or several of these of which one will do
-(`acceleration|attitude`). A base station has a total field that was measured: a constant has none, and errs in no way
-that a station does. A gradient is that of the field which an array travels through, or of the calibration site,
-known once an error model of the site is adopted.
+`total_field`, `base_station`, `turning`, `rotation`, `gradient`, `travel`, `waveform`), or several of these of which
+one will do (`acceleration|attitude`). A base station has a total field that was measured: a constant has none, and errs
+in no way that a station does. On a platform that stands still, memory of the field would be of the station's noise. A
+gradient is that of the field which an array travels through, or of the calibration site, known once an error model of
+the site is adopted.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from magtensor.error_models.excitation import Excitation
 from magtensor.error_models.settings import AnyChannel
 
 CONSTANT = 1e-9  # of the total field: what interpolation makes of one
+STILL = 0.01  # rad: the variation of the field turns it by a tenth of that, and by this in a great storm
 
 
 def measured(total_field: Array) -> bool:
@@ -31,6 +33,7 @@ FACTS: dict[str, Callable[[Excitation], bool]] = {
     "position": lambda x: x.position is not None,
     "total_field": lambda x: x.total_field is not None,
     "base_station": lambda x: x.total_field is not None and measured(x.total_field),
+    "turning": lambda x: x.swept > STILL,
     "rotation": lambda x: x.turns,
     "gradient": lambda x: x.site is not None or not x.uniform,
     "travel": lambda x: not x.uniform,
@@ -40,6 +43,7 @@ FACTS: dict[str, Callable[[Excitation], bool]] = {
 
 IN_WORDS = {
     "base_station": "a total field that was measured, and is no mere constant",
+    "turning": "a field that turns in the platform, by more than it varies by itself",
     "rotation": "a field that turns, so slowly between samples that its rate of change is known",
     "gradient": "a field that differs between the sensors",
     "travel": "a field that changes along the way",

@@ -85,6 +85,17 @@ class LagsOf(Range):
 
 
 @dataclass(frozen=True)
+class Plays(Range):
+    """Half widths of a play, nT, tried only where some output goes farther from where it began: a play that is never
+    taken up follows nothing, and is no more than a scale factor."""
+
+    def values(self, x: Excitation) -> list[Any]:
+        """The grid for a survey."""
+        farthest = float(np.max(np.abs(x.output - x.output[:1]), initial=0.0))
+        return [v for v in super().values(x) if v < farthest]
+
+
+@dataclass(frozen=True)
 class Delays(Range):
     """Delays of the base station, s, that its readings can show: they reach all but a fifth of the samples then.
 
