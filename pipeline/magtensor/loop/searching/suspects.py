@@ -90,10 +90,10 @@ class Suspects:
             at = f" from {when[0]} to {when[1]} s" if len(when) == 2 else f" at {when[0]} s" if when else ""
             return f"{'another ' * (name in adopted)}{name}{at}"
 
-        open_ = [(c, refused.get(c.model.name)) for c in suspects if c.passes]
+        open_ = [(c, refused.get(c.model.name, "")) for c in suspects if c.passes]
         near = sorted((c for c in last if c.adjusted_p < NEAR), key=lambda c: c.adjusted_p)
         return cls(
-            [f"{named(c)} ({why})" if why else named(c) for c, why in open_],
+            _by_reason([(named(c), why) for c, why in open_]),
             [named(c) for c in suspects if not c.passes],
             [c.model.name for c in seen if c.model.name not in noisy and c.of_second_order],
             [c.model.name for c in seen if c.model.name in noisy],
@@ -131,6 +131,16 @@ class Suspects:
             f"{' and '.join(self.small)}: significant, and less than {SECOND_ORDER**0.5:.1%} of the size of what is "
             "adopted, whose law may miss as much"
         ]
+
+
+def _by_reason(refused: Sequence[tuple[str, str]]) -> list[str]:
+    """Names and the reason against each, in words: a reason is given once, behind the names that it holds for."""
+    names: dict[str, list[str]] = {}
+    for name, why in refused:
+        names.setdefault(why, []).append(name)
+    plain = names.pop("", [])
+    listed = ((" and ".join(filter(None, (", ".join(each[:-1]), each[-1]))), why) for why, each in names.items())
+    return [f"{several} ({why})" for several, why in listed] + plain
 
 
 def _in_one_of(stretches: Sequence[tuple[float, float]], candidate: Candidate) -> bool:

@@ -68,7 +68,11 @@ def rate_instead(chosen: Candidate, state: State, models: Sequence[Component]) -
             if known > alone and gain(joined([terms, chosen.terms])) - known < HALF * alone:
                 return f"{model.name}, for which the field turns too fast between samples, explains more"
     if name := _quicker(chosen, seen, models):
-        return f"{name} with a time constant shorter than the samples show predicts as much: something quicker would do"
+        others = ", ".join(model.name for model in lacking)
+        return (
+            f"{name} with a time constant shorter than the samples show predicts as much: something quicker would do, "
+            f"as may {others}, which these samples cannot test"
+        )
     return ""
 
 
