@@ -17,6 +17,7 @@ from magtensor.loop.fitting.refit import joint_state
 from magtensor.loop.searching.like_a_station import (
     as_a_station_would,
     channels_of_the_total_field,
+    stations_like,
     turns_with_the_platform,
 )
 from magtensor.loop.searching.own_fit import plainer_forms
@@ -26,6 +27,7 @@ BESIDE_DRIFTS = [
     "temperature_offset", "temperature_scale", "current_field", "channel_response", "offset_drift", "warm_up",
     "reference_drift", "reference_scale",
 ]  # fmt: skip
+STATIONS = ["reference_drift", "reference_step", "reference_while", "reference_scale", "offset_drift", "scale_step"]
 FOLLOWING = ["temperature_scale", "temperature_offset", "channel_response"]
 
 
@@ -36,9 +38,26 @@ def test_scale_factors_that_drift_together_and_apart(sensors: tuple[int, ...], a
     for number in sensors:  # 100 ppm: 5 nT
         added[:, number] = 1e-4 * np.linspace(-1.0, 1.0, len(field))[:, None] * (field[:, number] - field.mean((0, 1)))
     record = synthetic(21, turning_s=4.0, added=added)
-    model = Adopted(Registry.load().find("error_model", "scale_drift"), {"order": 1, "span_s": 1199.0})
+    registry = Registry.load()
+    model = Adopted(registry.find("error_model", "scale_drift"), {"order": 1, "span_s": 1199.0})
     state = joint_state(record, [model], Fitting())
     assert as_a_station_would(state, 0) is alike
+    assert stations_like(state, [registry.find("error_model", name) for name in STATIONS]) == (
+        {"reference_drift"} if alike else set()
+    )
+
+
+@pytest.mark.parametrize("axes", [(1.0, 1.0, 1.0), (1.0, 0.0, 0.0)])
+def test_a_jump_of_all_scale_factors_may_be_one_of_the_base_station(axes: tuple[float, float, float]) -> None:
+    """Of one axis of all sensors it turns with the platform."""
+    field = synthetic(23, turning_s=4.0).raw
+    added = np.zeros_like(field)
+    added[700:] = 1e-4 * (field[700:] - field.mean((0, 1))) * axes
+    registry = Registry.load()
+    model = Adopted(registry.find("error_model", "scale_step"), {"time_s": 700.0})
+    state = joint_state(synthetic(23, turning_s=4.0, added=added), [model], Fitting())
+    found = stations_like(state, [registry.find("error_model", name) for name in STATIONS])
+    assert found == ({"reference_step"} if axes[1] else set())
 
 
 @pytest.mark.parametrize(("turning_s", "alike"), [(4.0, False), (80.0, True)])

@@ -5,20 +5,24 @@ What a vector in the sensors' axes makes of it turns with the platform, and no e
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from magtensor.calibration.types import Array
+from magtensor.components import Component
 from magtensor.error_models.excitation import Excitation
 from magtensor.error_models.needs import measured
+from magtensor.error_models.settings import EventTimes, profiled
 from magtensor.error_models.terms import Terms, joined
 from magtensor.loop.evidence.assessment import WHITE, Colours, assess, estimated, estimated_in, explained
 from magtensor.loop.evidence.grams import Whitened
 from magtensor.loop.evidence.residual import Residual
-from magtensor.loop.fitting.model import Adopted, State
+from magtensor.loop.fitting.model import Adopted, State, of_time
 from magtensor.loop.searching.contribution import a_tone, moments, put_back, slices, tones_of
+from magtensor.loop.searching.kin import TIME, drivers
 
 APART_ALPHA = 1e-4  # what no station does has to be as unlikely by chance
 HARDLY = 1e-3  # of the squares of |b| - F: a thirtieth of its size, to which the law of a drift is hardly known
@@ -56,6 +60,19 @@ def as_a_station_would(state: State, place: int) -> bool:
     turning, by_chance = _beyond(along, colours, mine, [others, alike])
     either = turning + _beyond(along, colours, alike, [others])[0]
     return by_chance > APART_ALPHA or turning < A_PART * either
+
+
+def stations_like(state: State, models: Sequence[Component]) -> set[str]:
+    """Names of the models of a base station that would look the same as the last adopted model, if that is of a course
+    of time or an event and all sensors show it alike: a drift of all their scale factors, or a jump."""
+    last = state.adopted[-1]
+    if last.component.effect != "instrument" or drivers(last, state.excitation) != {TIME}:
+        return set()
+    if not as_a_station_would(state, len(state.adopted) - 1):
+        return set()
+    times = len(moments(last))
+    like = (m for m in models if m.effect == "reference" and of_time(m))
+    return {m.name for m in like if times == sum(isinstance(g, EventTimes) for g in profiled(m).values())}
 
 
 def only_a_constant(x: Excitation) -> bool:

@@ -35,6 +35,7 @@ from magtensor.loop.searching.keeping import (
 )
 from magtensor.loop.searching.larger_law import follows_the_attitude, part_of_a_gradient, part_of_a_larger_law
 from magtensor.loop.searching.latent import NAME, Sought, renewed, sought, source_instead, tried_source
+from magtensor.loop.searching.like_a_station import stations_like
 from magtensor.loop.searching.likeness import followed_by_a_curve, part_of_the_source
 from magtensor.loop.searching.on_fewer_sensors import on_those_needed
 from magtensor.loop.searching.on_more_sensors import in_the_place_of_others, on_more_sensors
@@ -309,6 +310,7 @@ class Rounds:
                     elif tried.why == MAYBE_HEAT and stands_for_less(c, chosen, before.state):
                         refuse(c.model.name, f"{chosen.model.name} explains the same and more, and failed")
                 continue
+            rivals = tuple(sorted({*rivals, *stations_like(tried.after.state, self.models)}))
             return Kept(tried.after, chosen, rivals, channels, dropped, refused)
         return Kept(None, refused=refused)
 
