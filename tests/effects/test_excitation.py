@@ -91,6 +91,24 @@ def test_the_matrix_of_a_field_in_a_plane_is_found_as_far_as_it_shows() -> None:
     np.testing.assert_allclose(found[:, :, 2], np.broadcast_to([0.0, 0.0, 1.0], (4, 3)), atol=1e-9)
 
 
+@pytest.mark.parametrize("step", [0.3, 0.6])
+def test_how_wrong_a_rate_is(step: float) -> None:
+    """Told from its part along the field, whose rate is known in closed form; the ends of runs have more of it."""
+    t = np.arange(1000) * step
+    azimuth, elevation = 3.0 * np.sin(0.3 * t) + 2.0 * np.sin(0.17 * t), 1.2 * np.sin(0.23 * t + 1.0)
+    rate_a = 0.9 * np.cos(0.3 * t) + 0.34 * np.cos(0.17 * t)
+    rate_e = 1.2 * 0.23 * np.cos(0.23 * t + 1.0)
+    ca, sa, ce, se = np.cos(azimuth), np.sin(azimuth), np.cos(elevation), np.sin(elevation)
+    field = 5e4 * np.stack([ce * ca, ce * sa, se], axis=1)
+    exact = 5e4 * np.stack(
+        [-se * ca * rate_e - ce * sa * rate_a, -se * sa * rate_e + ce * ca * rate_a, ce * rate_e], axis=1
+    )
+    runs = [(0, 400), (400, 1000)]
+    wrong = rates.turning(t, runs, field) - exact
+    share = np.sqrt(np.sum(wrong**2) / np.sum(exact**2))
+    assert 0.3 * share < rates.error(t, runs, field) < 2.0 * share
+
+
 @pytest.mark.parametrize("step", [0.05, 0.4])
 def test_the_second_derivative_of_a_turn(step: float) -> None:
     """-w^2 of what turns at w. The noise is that of second differences of six samples' reach where the field turns a

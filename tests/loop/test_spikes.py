@@ -93,6 +93,31 @@ def test_the_field_is_seen_over_what_is_disturbed() -> None:
     np.testing.assert_array_equal(seen[299], disturbed[299])  # at the end of a run
 
 
+def test_where_the_field_turns_fast_what_is_beside_tells_less_than_the_sample() -> None:
+    """By 0.7 rad from sample to sample: a cubic over two such steps is off by a thousand nT."""
+    time = np.arange(200) * 0.5
+    angle = np.where(time < 50.0, 0.1 * time, 5.0 + 1.4 * (time - 50.0))
+    field = 5e4 * np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], axis=1)
+    keep = np.ones(200, dtype=bool)
+    keep[[40, 150]] = False
+    spike = np.array([120.0, -60.0, 30.0])
+    disturbed = field + spike * ~keep[:, None]
+    off = 150.0 * ~keep  # of four sensors one that is off by four times as much in the mean
+    seen = over_disturbances(disturbed, keep, time, np.zeros(200, dtype=int), off)
+    assert np.abs(seen - field)[40].max() < 3.0
+    np.testing.assert_array_equal(seen[150], disturbed[150])
+    assert np.abs(over_disturbances(disturbed, keep, time, np.zeros(200, dtype=int)) - field)[150].max() > 450.0
+
+
+def test_a_strong_filter_is_no_spike_where_the_field_turns_fastest(tmp_path: Path) -> None:
+    """It is largest there, and flagged before it has a name: with the field as samples beside have it, a delay would
+    explain more; and what an error of the rate leaves of it is no second effect."""
+    motion = {"type": "limited_tilt", "duration_s": 1800.0, "tilt_deg": 40.0}
+    survey = scenario(2000, {"type": "bandwidth", "rms_nT": 4.5}, motion=motion)
+    told = verdict_of(tmp_path, survey, None, ["sampling_lag", "bandwidth", "eddy_current", "averaging"])
+    assert len(told["adopted"]) == 1 and "bandwidth" in suspects(told)
+
+
 @pytest.mark.parametrize(("count", "share"), [(60, "2.5%"), (20, "0.8%")])
 def test_they_are_told_and_make_nothing_unexplained(tmp_path: Path, count: int, share: str) -> None:
     """One axis that is off by 400 nT in one sample of 40, or of 120."""

@@ -386,6 +386,11 @@ class Excitation(Acting):
         return rates.turning(self.time, self.runs(), self.field_or_fields)
 
     @cached_property
+    def rate_error(self) -> float:
+        """How wrong the rate of the field is, rms, as a share of it; 0 where it is not known at all."""
+        return rates.error(self.time, self.runs(), self.field[:, 0]) if self.turns else 0.0
+
+    @cached_property
     def curvature(self) -> Array:
         """d2B/dt2 (N, 3) nT/s2 where all sensors see one field, else (N, S, 3)."""
         return rates.curvature(self.time, self.runs(), self.field_or_fields, self.rate)

@@ -61,6 +61,15 @@ def turning(time: Array, runs: Runs, vectors: Array) -> Array:
     return out
 
 
+def error(time: Array, runs: Runs, vectors: Array) -> float:
+    """How wrong rates of vectors (N, 3) that turn are, rms, as a share of them: their differences along the vectors, of
+    which the length tells how much is right, are as wrong as those in the two directions across."""
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    change = derivative(time, runs, vectors)
+    wrong = np.sum(vectors / length * change, axis=-1, keepdims=True) - derivative(time, runs, length)
+    return float(np.sqrt(2.0 * np.sum(wrong**2) / max(float(np.sum(change**2)), 1e-300)))
+
+
 def curvature(time: Array, runs: Runs, vectors: Array, rate: Array) -> Array:
     """d2/dt2 of vectors (N, ..., 3) that turn, 1/s2, their rate being known.
 

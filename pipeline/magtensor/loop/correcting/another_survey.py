@@ -18,7 +18,7 @@ from magtensor.error_models.excitation import Excitation
 from magtensor.error_models.settings import Beginning, profiled
 from magtensor.loop.correcting.filled import filled
 from magtensor.loop.fitting.model import Adopted, Record
-from magtensor.loop.fitting.seen import over_disturbances
+from magtensor.loop.fitting.seen import over_disturbances, spread
 from magtensor.tensor.geometry import array_design
 
 TONE = "periodic_interference"
@@ -222,7 +222,7 @@ class Here:
     def of(cls, record: Record, calibration: ArrayCalibration, good: NDArray[np.bool_] | None = None) -> Here:
         contrast = _Contrast.of(record, calibration, good)
         b = filled(record.believed(calibration.apply(record.raw)), contrast.usable)
-        b = over_disturbances(b, contrast.usable, record.time, record.run)
+        b = over_disturbances(b, contrast.usable, record.time, record.run, spread(b))
         forward = np.asarray(np.linalg.inv(calibration.matrix), dtype=float)
         x = record.excitation(by_sensor(forward, b) + calibration.offset, b, matrix=forward)
         return cls(record, calibration, contrast, x)

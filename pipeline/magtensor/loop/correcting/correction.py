@@ -18,7 +18,7 @@ from magtensor.loop.correcting.another_survey import as_begun_here
 from magtensor.loop.correcting.filled import filled
 from magtensor.loop.fitting.model import Adopted, Record, State
 from magtensor.loop.fitting.refit import without
-from magtensor.loop.fitting.seen import over_disturbances
+from magtensor.loop.fitting.seen import over_disturbances, spread
 from magtensor.tensor.geometry import array_design
 
 MOST_STEPS = 8
@@ -100,7 +100,7 @@ def _terms(
     forward = np.asarray(np.linalg.inv(calibration.matrix), dtype=float)
     b = filled(record.believed(calibration.apply(raw)), good)
     if good is not None:
-        b = over_disturbances(b, good, record.time, record.run)
+        b = over_disturbances(b, good, record.time, record.run, spread(b))
     x = record.excitation(by_sensor(forward, b) + calibration.offset, b, matrix=forward)
     return [model.terms(x) for model in models]
 

@@ -17,6 +17,7 @@ from magtensor.loop.fitting.model import Adopted, Record, of_the_site
 
 LONGEST = 5  # samples that are disturbed one after the other, over which the field is seen from those beside them
 BESIDE = 8  # samples to either side, from which it is
+FARTHER = 3.0  # times: a spike of one of two sensors is twice as far from the truth as either is from their mean
 _MATTERS = 1e-10  # of the square of the field: noise with less makes no regressor noisy
 
 
@@ -33,7 +34,11 @@ def excitation_of(
     """
     believed = np.asarray(fit.keep) if seen is None else seen
     b = fit.scalar.field(fit.plane.coordinates(raw)) if fit.posterior is None else fit.posterior.field
-    b = over_disturbances(b, believed, record.time, record.run)
+    if not believed.all():
+        off = spread(by_sensor(np.linalg.inv(fit.forward), raw - fit.offset))
+        if off is not None and record.total_field is not None:
+            off = np.maximum(off, np.abs(np.linalg.norm(b, axis=1) - record.total_field))
+        b = over_disturbances(b, believed, record.time, record.run, off)
     b = of_known_length(b, record.total_field)
     q = nearest_frame(fit.forward)
 
@@ -47,13 +52,27 @@ def excitation_of(
     return record.excitation(*outputs_and_fields(b), lines, matrix=fit.forward @ q, again=again)
 
 
-def over_disturbances(b: Array, keep: NDArray[np.bool_], time: Array, run: NDArray[np.int_]) -> Array:
+def spread(fields: Array) -> Array | None:
+    """(N,) nT, how far the farthest of several sensors is from their mean, of fields (N, S, 3); None of one sensor."""
+    if fields.shape[1] == 1:
+        return None
+    return np.asarray(np.linalg.norm(fields - fields.mean(axis=1, keepdims=True), axis=2).max(axis=1))
+
+
+def over_disturbances(
+    b: Array, keep: NDArray[np.bool_], time: Array, run: NDArray[np.int_], off: Array | None = None
+) -> Array:
     """Fields (N, ...) nT without what disturbed single samples: a spike of one sensor is in the field that all are
     thought to see, and a rate of change or what remembers the field would have it for some time.
+
+    Where the field turns fast between samples those beside a sample tell less of it than itself, disturbed or not: an
+    effect that follows the turning is flagged there above all, before it has a name.
 
     Parameters
     ----------
     keep: (N,) samples that the fit believes; time: (N,) s; run: (N,) number of the contiguous run.
+    off: (N,) nT, by how much sensors are off from each other, or from a known length: what is farther from a sample
+        than `FARTHER` times that is no better; None where nothing tells.
     """
     starts, stops = in_a_row(~keep).T
     short = (stops - starts <= LONGEST) & (starts >= BESIDE) & (stops + BESIDE <= len(keep))
@@ -68,9 +87,21 @@ def over_disturbances(b: Array, keep: NDArray[np.bool_], time: Array, run: NDArr
         return b
     from scipy.interpolate import CubicSpline
 
+    guess = CubicSpline(time[near], b[near])(time[disturbed])
+    if off is not None:
+        far = np.abs(guess - b[disturbed]).reshape(len(guess), -1).max(axis=1)
+        worse = far > FARTHER * off[disturbed]
+        # what is next to a sample that is seen better by itself was flagged with it
+        worse = np.isin(_stretch(disturbed), _stretch(disturbed)[worse])
+        guess[worse] = b[disturbed][worse]
     out = b.copy()
-    out[disturbed] = CubicSpline(time[near], b[near])(time[disturbed])
+    out[disturbed] = guess
     return out
+
+
+def _stretch(flags: NDArray[np.bool_]) -> NDArray[np.int_]:
+    """For each flagged sample the number of its stretch of them."""
+    return np.asarray(np.cumsum(np.diff(flags.astype(int), prepend=0) > 0)[flags])
 
 
 def of_known_length(b: Array, total_field: Array | None) -> Array:

@@ -19,9 +19,9 @@ from magtensor.error_models.excitation import Excitation
 from magtensor.error_models.needs import FACTS
 from magtensor.error_models.terms import Terms
 from magtensor.loop.evidence.assessment import NEARLY_ALL, Assessment
-from magtensor.loop.fitting.model import Adopted, State, generic, of_time
+from magtensor.loop.fitting.model import Adopted, State, generic, of_time, turning
 from magtensor.loop.searching.contribution import a_tone, happens_once, moments
-from magtensor.loop.searching.gates import Candidate, explained_by, seen_between
+from magtensor.loop.searching.gates import SECOND_ORDER, Candidate, explained_by, seen_between
 
 MOST = 0.5  # of what a candidate explains
 POWERS = 6  # of time and of a channel: more than any law of an effect that has a name
@@ -34,20 +34,24 @@ DEGREE = "degree"  # of a field of the site that is cut off there: what it lacks
 def explained_beside(state: State, model: Adopted, terms: Terms, assessment: Assessment) -> float:
     """Sum of squares that the adopted models explain whose next order may be all that a candidate shows: not of the
     reference what differs between the sensors, nor of some sensors what others show, nor of what follows the field
-    alone what is added to the axes with a channel or with time, nor of an event what holds it."""
+    alone what is added to the axes with a channel or with time, nor of an event what holds it. Where the candidate
+    follows the field alone, those that follow its rate count for more, if that is known worse than a next order."""
+    x = state.excitation
     between = seen_between(state.residual, terms, assessment.estimate.theta[-terms.count :])
-    apart = terms.adds_to_axes and not generic(model) and bool(drivers(model, state.excitation))
-    return explained_by(
-        state,
-        [
-            place
-            for place, other in enumerate(state.adopted)
-            if not (between and other.component.effect == "reference")
-            and not (apart and _of_the_field_alone(other, state.excitation))
-            and not _holds(model, terms, state, place)
-            and (not other.sensors or _held_by(other.sensors, state, terms, assessment) > MOST)
-        ],
-    )
+    apart = terms.adds_to_axes and not generic(model) and bool(drivers(model, x))
+    places = [
+        place
+        for place, other in enumerate(state.adopted)
+        if not (between and other.component.effect == "reference")
+        and not (apart and _of_the_field_alone(other, x))
+        and not _holds(model, terms, state, place)
+        and (not other.sensors or _held_by(other.sensors, state, terms, assessment) > MOST)
+    ]
+    whole = explained_by(state, places)
+    turned = [place for place in places if turning(state.adopted[place].component)]
+    if turned and _of_the_field_alone(model, x) and (worse := x.rate_error**2 / SECOND_ORDER) > 1.0:
+        whole = max(whole, worse * explained_by(state, turned))
+    return whole
 
 
 def explained_by_kin(state: State, model: Adopted, terms: Terms, assessment: Assessment) -> float:

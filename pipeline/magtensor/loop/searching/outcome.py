@@ -236,7 +236,10 @@ def why(candidate: Candidate, winner: Candidate | None) -> str:
     if candidate.of_the_log and candidate.log_noise > 0:
         return f"noise in the log of a channel, which another model brought in, explains as much: {figures}"
     if candidate.of_second_order:
-        return f"less than 0.3 % of what is adopted, whose next order would explain as much: {figures}"
+        return (
+            "less than 0.3 % of what is adopted, or than the rate that it follows is known to; its next order would "
+            f"explain as much: {figures}"
+        )
     if candidate.of_the_law:
         return f"less than 5 % of an adopted effect of the same driver and sensors, whose law may miss it: {figures}"
     if candidate.of_no_shape:
