@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 from loop_cases import adopted_names, linear_state, scenario, synthetic, verdict_of
@@ -13,6 +14,7 @@ from magtensor.loop.searching.likeness import of_an_unseen_path
 from magtensor.registry import Registry
 
 POSTURES = {"type": "postures", "random_count": 136, "rest_s": 10.0, "turn_s": 3.0, "average": True}
+SWITCHED = {"type": "switched", "mean_hold_s": 70.0}
 ADOPTED = {
     "nonlinearity_cubic": {},
     "hysteresis": {"half_width_nT": 4000.0},
@@ -54,3 +56,20 @@ def test_what_is_quicker_than_the_way_between_postures_has_no_other_name(
     assert told["unexplained"]["present"]
     told_once = f"something quicker would do, as may {effect}, which these samples cannot test"
     assert told["unexplained"]["description"].count(told_once) == 1
+
+
+@pytest.mark.parametrize("seed", [71, pytest.param(76, marks=pytest.mark.long)])
+@pytest.mark.parametrize(
+    ("effect", "adopted"),
+    [
+        ({"type": "eddy_current", "rms_nT": 0.25}, set()),
+        ({"type": "latent_source", "rms_nT": 0.25, "waveform_of": SWITCHED}, {"latent_source"}),
+    ],
+)
+def test_a_waveform_that_goes_with_the_turn_before_is_no_source(
+    effect: dict[str, Any], adopted: set[str], seed: int, tmp_path: Path
+) -> None:
+    told = verdict_of(tmp_path, scenario(seed, effect, motion=POSTURES), None, ["latent_source"])
+    assert adopted_names(told) == adopted
+    words = "it goes with how far the field turned since the sample before, as what is quicker would make it"
+    assert (words in told["unexplained"]["description"]) is (not adopted)

@@ -51,6 +51,7 @@ from magtensor.loop.searching.likeness import (
     followed_by_a_curve,
     held_out_losses,
     of_an_unseen_path,
+    with_the_turn_before,
 )
 
 LEAST_SENSORS = 3  # from here on noise of single sensors does not imitate a factor
@@ -149,6 +150,8 @@ def sought(state: State, record: Record, *, may_follow: bool = False) -> Sought 
     elif (unseen := of_an_unseen_path(state)) and n * float(seen @ seen) <= explained_by(state, unseen):
         name = state.adopted[unseen[0]].name
         objection = f"it is less than {name} explains, which remembers the field on the way between the samples"
+    elif with_the_turn_before(state.excitation, residual.samples, values):
+        objection = "it goes with how far the field turned since the sample before, as what is quicker would make it"
     elif not gain.consistent:
         objection = "the sensors do not predict each other with it on held-out stretches"
     elif like is not None and not may_follow:

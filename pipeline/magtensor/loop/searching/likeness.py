@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from magtensor.calibration.types import Array
 from magtensor.error_models.curves import along_a_curve, bends_of
+from magtensor.error_models.excitation import Excitation
 from magtensor.error_models.independent import independent
 from magtensor.error_models.terms import Terms
 from magtensor.error_models.waveform import NAME, free_directions
@@ -23,6 +24,7 @@ MOST_LAG = 0.1  # of the survey, in which a channel is compared with the wavefor
 COMPARED = 400  # points at which it is
 MOST_COMPARED = 20000
 LEAST_POWER = 1e-9  # of a series' own, below which it is constant there
+OF_THE_TURN = 1e-3  # probability that a waveform goes with the turn before by chance
 LIKE_AN_EFFECT = 0.9  # cosine; of two directions off the plane of four sensors one pair in a thousand is nearer
 ONE_SENSOR = 0.9  # of what something that happened once does
 ONE_DIRECTION = 0.9  # of an effect's power
@@ -316,3 +318,26 @@ def of_an_unseen_path(state: State) -> list[int]:
         if np.linalg.norm(whole - part) > REMEMBERS * np.linalg.norm(whole):
             places.append(place)
     return places
+
+
+def with_the_turn_before(x: Excitation, samples: NDArray[np.int_], values: Array) -> bool:
+    """Whether a waveform (n,) at some samples goes with how far the field turned since the sample before, where nobody
+    saw it turn: what remembers the way to a posture, an eddy current, a filter or a play, makes such a one."""
+    from scipy.special import fdtrc
+
+    if x.turns:
+        return False
+    b = x.field[:, 0] / np.linalg.norm(x.field[:, 0], axis=1, keepdims=True)
+    turned = np.diff(b, axis=0, prepend=b[:1])
+    given = np.column_stack([np.ones(len(samples)), b[samples]])
+    without = _left(values, given)
+    left = _left(values, np.column_stack([given, turned[samples]]))
+    freedom = len(values) - given.shape[1] - 3
+    if freedom <= 0 or left <= 0.0:
+        return False
+    return bool(fdtrc(3, freedom, (without - left) / 3.0 / (left / freedom)) < OF_THE_TURN)
+
+
+def _left(values: Array, regressors: Array) -> float:
+    """Sum of squares of values (n,) that regressors (n, K) leave."""
+    return float(np.sum((values - regressors @ np.linalg.lstsq(regressors, values, rcond=None)[0]) ** 2))
