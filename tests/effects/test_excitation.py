@@ -91,6 +91,16 @@ def test_the_matrix_of_a_field_in_a_plane_is_found_as_far_as_it_shows() -> None:
     np.testing.assert_allclose(found[:, :, 2], np.broadcast_to([0.0, 0.0, 1.0], (4, 3)), atol=1e-9)
 
 
+def test_a_field_that_is_not_known_somewhere_has_no_curvature_there() -> None:
+    t = np.arange(100) * 0.1
+    turned = 5e4 * np.stack([np.cos(t), np.sin(t), 0.0 * t], axis=1)
+    rate = rates.turning(t, [(0, 100)], turned)
+    rate[90:] = np.nan
+    found = rates.curvature(t, [(0, 100)], turned, rate)
+    assert np.isfinite(found[:90]).all() and np.isnan(found[90:, :2]).all()
+    assert np.isnan(rates.curvature(t, [(0, 100)], turned, np.full_like(rate, np.nan))[:, :2]).all()
+
+
 @pytest.mark.parametrize("step", [0.3, 0.6])
 def test_how_wrong_a_rate_is(step: float) -> None:
     """Told from its part along the field, whose rate is known in closed form; the ends of runs have more of it."""

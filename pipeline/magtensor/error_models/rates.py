@@ -103,8 +103,11 @@ def curvature(time: Array, runs: Runs, vectors: Array, rate: Array) -> Array:
 
 
 def _where_it_turns(turns: Array) -> float:
-    """rad/s: the rate of turn (N,) at which half of the squares of all are larger, and half smaller."""
-    ordered = np.sort(turns)
+    """rad/s: the rate of turn (N,) at which half of the squares of all that are known are larger, and half smaller; 0
+    where none is."""
+    ordered = np.sort(turns[np.isfinite(turns)])
+    if not len(ordered):
+        return 0.0
     below = np.cumsum(ordered**2)
     return float(ordered[np.searchsorted(below, below[-1] / 2.0)])
 
