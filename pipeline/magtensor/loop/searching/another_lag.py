@@ -3,7 +3,8 @@
 A sensor and its electronics warm up at different rates beside one thermometer, and heat creeps through a housing as it
 does through many lags at once. While one of them is in, smooth courses of time explain more of what is left than any
 second lag that is not at its best yet, and a warming up or a drift is adopted. Once nothing else is found the second
-lag is sought beside all the others, and takes the place of the course if that is likelier.
+lag is sought beside all the others, and takes the place of the course if that is likelier. Only of a course with the
+same vectors at the sensors: a drift of its own is no such thing, though a lag may follow it better than a law of time.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from magtensor.calibration.types import Array
 from magtensor.error_models.settings import Range, profiled
 from magtensor.errors import DataError
 from magtensor.loop.fitting.model import Adopted, Fitting, Record, State
@@ -26,6 +28,7 @@ from magtensor.loop.searching.found import Step
 from magtensor.loop.searching.gates import Candidate
 from magtensor.loop.searching.keeping import why_not
 from magtensor.loop.searching.kin import TIME, drivers
+from magtensor.loop.searching.likeness import LIKE_AN_EFFECT, ONE_DIRECTION
 from magtensor.loop.searching.own_fit import at_its_fit
 from magtensor.loop.searching.rivals import hardly_begun
 
@@ -70,15 +73,15 @@ def with_another_lag(
 
 
 def _seconds(state: State, place: int) -> Iterator[tuple[Adopted, float]]:
-    """Each adopted response that lags, once more on the sensors of the course at a place, with the lag that suits what
-    this explains best, and how many lags were tried; not if it has more coefficients."""
+    """Each adopted response that lags and has the vectors of the course at a place, once more on the sensors of that,
+    with the lag that suits what it explains best, and how many lags were tried; not if it has more coefficients."""
     assert state.terms is not None
     x, course, own = state.excitation, state.adopted[place], slices(state)[place]
     without = put_back_one(state, place)
     names = [model.name for model in state.adopted]
-    for model in state.adopted:
+    for number, model in enumerate(state.adopted):
         found = beginning(model.component, model.settings)
-        if found is None or names.count(model.name) > 1:
+        if found is None or names.count(model.name) > 1 or not _along(state, place, number):
             continue
         starts, mark = found
         grid = profiled(model.component)[mark.lag]
@@ -90,3 +93,18 @@ def _seconds(state: State, place: int) -> Iterator[tuple[Adopted, float]]:
         if possible:
             gains = [fold_gain(without, state.colours, m.terms(x).at(state.residual.samples)).total for m in possible]
             yield possible[int(np.argmax(gains))], float(len(lags))
+
+
+def _along(state: State, place: int, other: int) -> bool:
+    """Whether two adopted models add to the outputs along the same vectors at the sensors, nearly all of the one."""
+
+    def direction(number: int) -> tuple[Array, float]:
+        added = (
+            state.adopted[number].terms(state.excitation).contribution(state.theta[number], len(state.residual.noise))
+        )
+        added = (added - added.mean(axis=0)) / state.residual.noise
+        _, sizes, directions = np.linalg.svd(added, full_matrices=False)
+        return directions[0], float(sizes[0] ** 2 / max(float(np.sum(sizes**2)), 1e-300))
+
+    (mine, share), (theirs, _) = direction(place), direction(other)
+    return share > ONE_DIRECTION and bool(abs(mine @ theirs) > LIKE_AN_EFFECT)
