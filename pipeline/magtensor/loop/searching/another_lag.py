@@ -96,15 +96,16 @@ def _seconds(state: State, place: int) -> Iterator[tuple[Adopted, float]]:
 
 
 def _along(state: State, place: int, other: int) -> bool:
-    """Whether two adopted models add to the outputs along the same vectors at the sensors, nearly all of the one."""
+    """Whether two adopted models add to the outputs along the same vectors at the sensors, nearly all of the one; not
+    asked of what one sensor makes alone: the three numbers of two such vectors agree by chance one time in ten."""
+    noise = state.residual.noise
 
     def direction(number: int) -> tuple[Array, float]:
-        added = (
-            state.adopted[number].terms(state.excitation).contribution(state.theta[number], len(state.residual.noise))
-        )
-        added = (added - added.mean(axis=0)) / state.residual.noise
+        added = state.adopted[number].terms(state.excitation).contribution(state.theta[number], len(noise))
+        added = (added - added.mean(axis=0)) / noise
         _, sizes, directions = np.linalg.svd(added, full_matrices=False)
         return directions[0], float(sizes[0] ** 2 / max(float(np.sum(sizes**2)), 1e-300))
 
     (mine, share), (theirs, _) = direction(place), direction(other)
-    return share > ONE_DIRECTION and bool(abs(mine @ theirs) > LIKE_AN_EFFECT)
+    several = int(np.count_nonzero(mine)) > 3
+    return several and share > ONE_DIRECTION and bool(abs(mine @ theirs) > LIKE_AN_EFFECT)
