@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from magtensor.calibration import nominal as nominal_module
 from magtensor.calibration.joint import calibrated, fit_joint, nearest_frame
 from magtensor.calibration.known import Known
 from magtensor.calibration.nominal import Nominal, fit_nominal
-from magtensor.calibration.nominal_steps import NominalData
+from magtensor.calibration.nominal_steps import NominalData, _system
 from magtensor.calibration.types import Array
 from magtensor.calibration.undetermined import Undetermined
 from magtensor.errors import DataError, NotEnoughData
@@ -179,3 +180,14 @@ def test_a_prior_that_determines_nothing_is_no_lack_of_attitudes(
     assert doubt.facts()["determined"] is enough
     assert ("the attitudes do not determine the calibration" in doubt.sentence) is not enough
     assert (f"there was no fit ({why}), but the attitudes determine the calibration" in doubt.sentence) is enough
+
+
+def test_a_fit_that_runs_away_is_refused_as_one() -> None:
+    """A sensor that stands still beside an effect of the wrong size: scores that hardly vary by themselves."""
+    covariance = np.full((12, 12), 1e10)
+    np.fill_diagonal(covariance, 0.0)
+    scores = (np.zeros(12), np.zeros((12, 12)), covariance)
+    away = SimpleNamespace(basis=lambda here: np.eye(4), equations=lambda *_: scores)
+    rows = np.eye(3, 4)
+    with pytest.raises(NotEnoughData, match="does not converge"):
+        _system(cast(Any, away), cast(Any, SimpleNamespace(rows=rows)), (1.0, 1.0), np.ones(12), rows)

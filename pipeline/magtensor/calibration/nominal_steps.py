@@ -224,7 +224,11 @@ def _system(
     score, change, covariance = data.equations(here, weights, basis)
     away = (here.rows - nominal).ravel() / std
     root = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
-    values, vectors = np.linalg.eigh(covariance / np.outer(root, root))
+    with np.errstate(over="ignore", invalid="ignore"):
+        correlation = covariance / np.outer(root, root)
+    if not np.isfinite(correlation).all():
+        raise NotEnoughData(DIVERGES, hint=HINT)
+    values, vectors = np.linalg.eigh(correlation)
     real = values > ROUNDING * values[-1]
     whiten = vectors.T[real] / np.sqrt(values[real])[:, None] / root
     # no products of these: what the samples know beside the prior differs by fourteen orders of magnitude
