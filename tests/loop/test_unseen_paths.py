@@ -6,11 +6,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from loop_cases import adopted_names, linear_state, scenario, synthetic, verdict_of
 
 from magtensor.loop.fitting.model import Adopted
-from magtensor.loop.searching.likeness import of_an_unseen_path
+from magtensor.loop.searching.likeness import of_an_unseen_path, with_the_turn_before
 from magtensor.registry import Registry
 
 POSTURES = {"type": "postures", "random_count": 136, "rest_s": 10.0, "turn_s": 3.0, "average": True}
@@ -56,6 +57,21 @@ def test_what_is_quicker_than_the_way_between_postures_has_no_other_name(
     assert told["unexplained"]["present"]
     told_once = f"something quicker would do, as may {effect}, which these samples cannot test"
     assert told["unexplained"]["description"].count(told_once) == 1
+
+
+def test_a_source_turns_the_field_that_a_platform_at_rest_sees() -> None:
+    """Its course is then known from the sample before, and no memory of a turn."""
+    x = linear_state(synthetic(31, 400)).excitation  # attitudes without any order
+    rng = np.random.default_rng(32)
+    samples, course = np.arange(400), np.cumsum(rng.standard_normal(400))
+    assert not with_the_turn_before(x, samples, course)
+    turned = np.diff(x.field[:, 0, 2], prepend=x.field[0, 0, 2]) / 5e4
+    assert with_the_turn_before(x, samples, turned + rng.standard_normal(400))
+    at_rest = 5e4 * np.array([0.4, 0.0, 0.9]) + 5.0 * rng.standard_normal((400, 3))
+    field = at_rest + course[:, None] * [1.0, 0.5, -0.5]
+    resting = replace(x, field=np.repeat(field[:, None], 4, axis=1))
+    assert not resting.turns
+    assert not with_the_turn_before(resting, samples, course)
 
 
 @pytest.mark.parametrize("seed", [71, pytest.param(76, marks=pytest.mark.long)])

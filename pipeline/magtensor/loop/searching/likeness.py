@@ -12,6 +12,7 @@ from magtensor.calibration.types import Array
 from magtensor.error_models.curves import along_a_curve, bends_of
 from magtensor.error_models.excitation import Excitation
 from magtensor.error_models.independent import independent
+from magtensor.error_models.rates import LARGEST_TURN
 from magtensor.error_models.terms import Terms
 from magtensor.error_models.waveform import NAME, free_directions
 from magtensor.loop.evidence.folds import FOLDS
@@ -322,13 +323,16 @@ def of_an_unseen_path(state: State) -> list[int]:
 
 def with_the_turn_before(x: Excitation, samples: NDArray[np.int_], values: Array) -> bool:
     """Whether a waveform (n,) at some samples goes with how far the field turned since the sample before, where nobody
-    saw it turn: what remembers the way to a posture, an eddy current, a filter or a play, makes such a one."""
+    saw it turn: what remembers the way to a posture, an eddy current, a filter or a play, makes such a one. On a
+    platform that hardly moves meanwhile the source itself turns the field that is seen."""
     from scipy.special import fdtrc
 
     if x.turns:
         return False
     b = x.field[:, 0] / np.linalg.norm(x.field[:, 0], axis=1, keepdims=True)
     turned = np.diff(b, axis=0, prepend=b[:1])
+    if np.mean(np.sum(turned**2, axis=1)) < LARGEST_TURN**2:
+        return False
     given = np.column_stack([np.ones(len(samples)), b[samples]])
     without = _left(values, given)
     left = _left(values, np.column_stack([given, turned[samples]]))
