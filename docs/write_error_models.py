@@ -57,9 +57,9 @@ every recipe.
   several together.
 - Keyword parameters are settings: a type, how it is profiled (`Range`, `Choice`, `Orders`, `Laws`, `Forms`,
   `Beginning`, `AnyChannel`, `EventTimes`, `Frequencies`, `Duration`), a description, and a default.
-- `needs` names what it cannot do without: channels (`current_*`), `attitude`, `position`, `total_field`, `rotation`
-  (samples dense enough for rates of change), `gradient` (a field that differs between the sensors); `a|b` where one of
-  two will do.
+- `needs` names what it cannot do without: channels (`current_*`), `attitude`, `position`, `total_field`, `turning`
+  (the platform does not stand still), `rotation` (samples dense enough for rates of change), `gradient` (a field that
+  differs between the sensors); `a|b` where one of two will do.
 - `pointwise=True` says that its regressors at a sample follow from that sample alone (channels and thermometers may
   be lagged); settings with many values are then searched faster. `agrees=function(x, settings, coefficients,
   explained)` says whether fitted coefficients are what the settings assume, where both mean one thing, and explain as

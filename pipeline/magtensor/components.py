@@ -278,7 +278,8 @@ def error_model(
             another survey's field) or "reference" (corrects the total field).
         name: the function's own if left out.
         needs: channels and facts without which it cannot be tried: names of channels (`temperature`,
-            `current_*`), `attitude`, `position`, `total_field`, `rotation` (samples dense enough for rates of change).
+            `current_*`), `attitude`, `position`, `total_field`, `turning` (the platform does not stand still),
+            `rotation` (samples dense enough for rates of change).
         source: where the model comes from.
         typical: its usual magnitude, in words.
         pointwise: its regressors at a sample follow from that sample alone (logged channels may be lagged), so that its

@@ -26,7 +26,7 @@ def behind(driven: np.ndarray, tau_s: float) -> np.ndarray:
     return out
 
 
-def warmed(seed: int, course: str) -> Record:
+def warmed(seed: int, course: str, along: bool = True) -> Record:
     """A rig whose temperature sways; three fifths of what heat adds come through 15 s and the rest through 200 s, or as
     something that warms up, or drifts, by itself."""
     rng = np.random.default_rng(100 + seed)
@@ -40,7 +40,7 @@ def warmed(seed: int, course: str) -> Record:
         "offset_drift": 6.0 * time / time[-1],
     }[course]
     vectors = rng.normal(scale=1.0, size=(4, 3))
-    others = vectors if course == "heat" else rng.normal(scale=1.0, size=(4, 3))
+    others = vectors if along else rng.normal(scale=1.0, size=(4, 3))
     added = 0.6 * quick[:, None, None] * vectors + 0.4 * slow[:, None, None] * others
     return replace(
         synthetic(seed, SAMPLES, noise_nT=0.2, turning_s=4.0, added=added[::STEPS]),
@@ -75,6 +75,8 @@ def test_a_second_lag_takes_the_place_of_a_course_of_time(seed: int, name: str) 
 
 @pytest.mark.parametrize("seed", [4, pytest.param(5, marks=pytest.mark.long), pytest.param(6, marks=pytest.mark.long)])
 @pytest.mark.parametrize("course", ["warm_up", "offset_drift"])
-def test_a_course_of_time_stays(seed: int, course: str) -> None:
-    record = warmed(seed, course)
+@pytest.mark.parametrize("along", [True, False])
+def test_a_course_of_time_stays(seed: int, course: str, along: bool) -> None:
+    """Whether it has the vectors of the response or its own."""
+    record = warmed(seed, course, along)
     assert with_another_lag(record, with_a_course(record, course), Fitting(), 0, 40, 0.005) is None
