@@ -151,11 +151,12 @@ def test_what_another_width_of_an_adopted_law_explains_is_no_other_effect(
     monkeypatch.setattr(rounds, "part_of_a_gradient", lambda *_: "")
     monkeypatch.setattr(rounds, "part_of_a_drift", lambda *_: None)
     monkeypatch.setattr(rounds, "beside_time", lambda *_: BesideTime(True))
+    monkeypatch.setattr(rounds, "is_a_course", lambda *_: False)
     monkeypatch.setattr(rounds, "part_of", lambda *_: False)
     monkeypatch.setattr(rounds, "overlaps", lambda c, failed, _: failed is width and c is creep)
     for each in (width, creep, other):
         each.predicts = True
-    given: Any = SimpleNamespace(state=None)
+    given: Any = SimpleNamespace(state=SimpleNamespace(excitation=None))
     search = rounds.Rounds([], 0, 8, 0.005, None, None)
     found = search.first_kept(given, given, [width, creep, other], given, 30)
     assert found.standing is None and found.refused["hysteresis"] == why
@@ -194,6 +195,7 @@ def test_of_one_name_the_curve_of_another_channel_is_still_tried(monkeypatch: py
         "as_predictive": lambda *_: set(),
         "by_a_worse_log": lambda *_: set(),
         "beside_time": lambda *_: BesideTime(True),
+        "is_a_course": lambda *_: False,
         "outdone_by": lambda chosen, _: "wind" if chosen is line else "",
         "part_of_a_waveform": lambda *_: "",
         "by_any_law_of": curves,

@@ -101,7 +101,8 @@ def test_what_fails_alone_is_kept_if_both_help(
     folds = np.arange(3)
 
     def standing(error: dict[str, float], adopted: int) -> Trial:
-        state: Any = SimpleNamespace(adopted=(None,) * adopted, excitation=None)
+        fit = SimpleNamespace(keep=np.ones(3, dtype=bool))
+        state: Any = SimpleNamespace(adopted=(None,) * adopted, excitation=None, fit=fit)
         squares = np.array([list(error.values())] * 2) ** 2
         return Trial(state, BlockErrors(tuple(error), np.ones((2, 2), dtype=int), squares, squares), folds)
 

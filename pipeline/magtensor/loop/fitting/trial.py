@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from magtensor.calibration.joint_together import ABOUT
 from magtensor.calibration.types import Array
 from magtensor.loop.evidence.assessment import log_likelihood
 from magtensor.loop.fitting.errors_before_after import calibrated_fields, folds_for, held_out
@@ -93,11 +94,12 @@ def trial(record: Record, state: State, how: Fitting) -> Trial:
 
 
 def on_the_folds_of(after: Trial, record: Record, before: Trial, how: Fitting) -> Trial:
-    """A trial on the folds of another one, if they are others; then on the samples that one believes, too.
+    """A trial on the folds of another one and the samples that one believes, if those are others or these are more.
 
-    What happens once may have been flagged before it had a name.
+    What happens once, or where a channel is at an end, may have been flagged before it had a name.
     """
-    if np.array_equal(before.folds, after.folds):
+    more = np.count_nonzero(after.state.fit.keep & ~before.state.fit.keep)
+    if np.array_equal(before.folds, after.folds) and more <= ABOUT:
         return before
     return _judged(record, before.state, how, after.state.fit.keep, after.folds)
 

@@ -164,15 +164,19 @@ def _nT(own: Array, noise: Array) -> Array:
 def _at_an_end(flagged: Mask, state: State, record: Record) -> str:
     """In words, the channel that an adopted effect follows and that is at its largest or smallest in flagged samples:
     there the law of the effect may be another one."""
-    kept = ~flagged
     for channel in sorted({c for model in state.adopted for c in model.channels(state.excitation)}):
-        values = record.logged[channel].reshape(len(flagged), -1)
-        if values.shape[1] != 1 or not kept.any():
-            continue
-        usual = np.sort(values[kept, 0])
-        ranks = [np.searchsorted(usual, values[flagged, 0], side) for side in ("left", "right")]
-        above = float(np.mean(ranks)) / len(usual)
-        if max(above, 1.0 - above) > AT_AN_END:
-            end = "largest" if above > AT_AN_END else "smallest"
+        if end := end_of(record.logged[channel], flagged):
             return f", mostly where {channel} is {end}: what follows it may not go on there as it was fitted"
     return ""
+
+
+def end_of(values: Array, flagged: Mask) -> str:
+    """Whether a channel (N,) is "largest" or "smallest" where samples (N,) are flagged, of those that are not; "" where
+    it is neither, or a vector."""
+    column = values.reshape(len(flagged), -1)
+    if column.shape[1] != 1 or flagged.all() or not flagged.any():
+        return ""
+    usual = np.sort(column[~flagged, 0])
+    ranks = [np.searchsorted(usual, column[flagged, 0], side) for side in ("left", "right")]
+    above = float(np.mean(ranks)) / len(usual)
+    return "largest" if above > AT_AN_END else "smallest" if 1.0 - above > AT_AN_END else ""

@@ -14,6 +14,7 @@ from math import comb
 
 import numpy as np
 
+from magtensor.calibration.joint_together import ABOUT
 from magtensor.calibration.types import Array
 from magtensor.components import Component
 from magtensor.error_models.curves import bends_of
@@ -31,6 +32,7 @@ from magtensor.loop.fitting.refit import joint_state
 from magtensor.loop.fitting.separation import fold_gain, separated
 from magtensor.loop.fitting.trial import Trial, on_the_folds_of, trial
 from magtensor.loop.remainder.curve_of_a_channel import PIECES, another_curve, followed
+from magtensor.loop.remainder.flagged import end_of
 from magtensor.loop.searching.adopting import polished
 from magtensor.loop.searching.contribution import eliminate, put_back_some
 from magtensor.loop.searching.found import Step
@@ -136,6 +138,13 @@ def by_any_law_of(channel: str, state: State, models: Sequence[Component], alpha
         curves = [_by_a_curve(state, Adopted(component, plain | way), [], channels, alpha, len(models)) for way in ways]
         found += [max((c for c in curves if c), key=lambda c: c.assessment.gain.total)] if any(curves) else []
     return found
+
+
+def at_an_end(state: State) -> list[str]:
+    """The channels with one value that are at an end of their range where samples fit nothing, if these are more than a
+    few: there something may act that does so nowhere else."""
+    wrong = ~np.asarray(state.fit.keep)
+    return [n for n, values in state.excitation.logged.items() if end_of(values, wrong)] if wrong.sum() > ABOUT else []
 
 
 def outdone_by(chosen: Candidate, state: State) -> str:

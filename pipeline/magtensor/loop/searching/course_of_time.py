@@ -146,16 +146,21 @@ def _compared(model: Adopted, theta: Array, before: State) -> _Compared | None:
     )
 
 
+def is_a_course(model: Adopted, x: Excitation) -> bool:
+    """Whether a model is of what drifts or settles, all along."""
+    return TIME in drivers(model, x) and not happens_once(model)
+
+
 def rivals_in_time(candidate: Candidate, possible: Sequence[Candidate], state: State) -> set[str]:
     """The models of what drifts or settles most of which a candidate predicts as well."""
-    of_time = (c for c in possible if TIME in drivers(c.model, state.excitation) and not happens_once(c.model))
+    of_time = (c for c in possible if is_a_course(c.model, state.excitation))
     return {c.model.name for c in of_time if c is not candidate and overlaps(c, candidate, state)}
 
 
 def responses_like(drift: Candidate, courses: Sequence[Candidate], state: State) -> set[str]:
     """The models of responses that are refused for smooth courses of time and predict most of what a drift does: it is
     one of those courses, and nothing tells which of them there is."""
-    if not courses or TIME not in drivers(drift.model, state.excitation) or happens_once(drift.model):
+    if not courses or not is_a_course(drift.model, state.excitation):
         return set()
     return {c.model.name for c in courses if overlaps(drift, c, state)}
 

@@ -15,10 +15,10 @@ from magtensor.loop.fitting.trial import Trial, on_the_folds_of, trial
 from magtensor.loop.remainder.predictable import by_what_they_read
 from magtensor.loop.remainder.tones import channels_of_the_line, tones
 from magtensor.loop.searching.another_lag import with_another_lag
-from magtensor.loop.searching.any_law import OUTPUTS, by_a_curve, by_any_law, by_any_law_of, outdone_by
+from magtensor.loop.searching.any_law import OUTPUTS, at_an_end, by_a_curve, by_any_law, by_any_law_of, outdone_by
 from magtensor.loop.searching.beside_a_hole import of_a_hole
 from magtensor.loop.searching.contribution import eliminate, tones_of, without_models
-from magtensor.loop.searching.course_of_time import beside_time, responses_like, rivals_in_time
+from magtensor.loop.searching.course_of_time import beside_time, is_a_course, responses_like, rivals_in_time
 from magtensor.loop.searching.exchange import exchanged, looked_at_again
 from magtensor.loop.searching.found import Kept, Step
 from magtensor.loop.searching.gates import Candidate
@@ -186,6 +186,9 @@ class Rounds:
                 continue
             shared = sought(state, record)
             kept = self.by_its_channel(record, standing, shared, how, open_)
+            if kept.standing is None and (ends := at_an_end(state)):
+                curves = [c for channel in ends for c in self.curves_of(channel, state)]
+                kept = self.first_kept(record, standing, curves, how, open_, with_others=False)
             if kept.standing is None and by_what_they_read(state).any():
                 kept = self.first_kept(record, standing, self.curves_of(OUTPUTS, state), how, open_, with_others=False)
             if kept.standing is not None:
@@ -262,9 +265,12 @@ class Rounds:
             if why := of_no_law(chosen, switched, [*candidates, *left], before.state):
                 refuse(chosen.model.name, why)
                 continue
+            x = before.state.excitation
+            if is_a_course(chosen.model, x) and ask(name for name in x.logged if not x.is_vector(name)):
+                continue  # what rises with time may be any curve of what did
             chosen, channels = nearest(chosen, before.state, models, anything)
             frequencies = tones_of(chosen.model)
-            of_a_tone = [c for f in frequencies for c in channels_of_the_line(before.state.excitation, f)]
+            of_a_tone = [c for f in frequencies for c in channels_of_the_line(x, f)]
             if same := (*switched, *of_a_tone):
                 channels, rivals = same, tuple(sorted({*rivals, CHANNEL}))
             time = beside_time(chosen, before.state)
