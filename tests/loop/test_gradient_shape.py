@@ -17,6 +17,7 @@ from magtensor.loop.remainder.gradient_shape import gradient_share, only_of_a_gr
 
 Array = NDArray[np.float64]
 TILTED = {"type": "limited_tilt", "duration_s": 1200.0, "tilt_deg": 40.0}
+TRIANGLE = np.array([[0.3, 0, 0], [-0.15, 0.26, 0], [-0.15, -0.26, 0]])  # gradients leave one direction of six
 CROSS = np.array([[0.3, 0, 0], [-0.3, 0, 0], [0, 0.3, 0], [0, -0.3, 0]])
 
 
@@ -47,10 +48,29 @@ def test_errors_of_the_sensors_and_a_single_waveform_have_no_such_shape() -> Non
     assert share_of(3.0 * rng.standard_normal((1200, 4, 3)), CROSS) == 0.0
     one = 5.0 * np.sin(np.arange(1200) / 7.0)[:, None, None] * (np.diag([1.0, 1.0, -2.0]) @ CROSS.T).T
     assert share_of(one, CROSS) == 0.0  # whoever makes it
-    triangle = np.array([[0.3, 0, 0], [-0.15, 0.26, 0], [-0.15, -0.26, 0]])  # it leaves one direction of six
     noisy = np.zeros((1200, 3, 3))
     noisy[:, 1] = 0.3 * np.cumsum(np.random.default_rng(7).standard_normal((1200, 3)), axis=0)
-    assert share_of(noisy, triangle) == 0.0
+    assert share_of(noisy, TRIANGLE) == 0.0
+
+
+@pytest.mark.parametrize("waveforms", [2, 3])
+def test_of_three_sensors_errors_seldom_look_like_it(waveforms: int) -> None:
+    """With as many courses of time, in any proportion, of which one direction of six holds little by chance."""
+    found = 0
+    for seed in range(100):
+        rng = np.random.default_rng(1000 + seed)
+        phase = 2.0 * np.pi * rng.random(waveforms)
+        courses = 5.0 * np.sin(np.arange(600)[:, None] / [40.0, 55.0, 70.0][:waveforms] + phase)
+        record = synthetic(
+            2000 + seed, 600, sensors=3, added=np.tensordot(courses, rng.standard_normal((waveforms, 3, 3)), 1)
+        )
+        found += gradient_share(linear_state(replace(record, position=TRIANGLE)), TRIANGLE) > 0.0
+    assert found <= 5  # of 1 expected, with a probability of 0.9995
+
+
+def test_of_three_sensors_a_gradient_is_still_seen() -> None:
+    for seed in range(5):
+        assert share_of(drawn(np.random.default_rng(seed), TRIANGLE), TRIANGLE) > 0.9
 
 
 def test_nothing_has_that_shape_where_a_sensor_has_less_noise_than_its_quickest_errors() -> None:

@@ -18,6 +18,7 @@ from magtensor.loop.fitting.separation import SEPARATION
 MODEL = "site_gradient"
 MOST_OUTSIDE = 0.1  # of the variance of each of its directions: what any other direction holds at most
 LEAST_SECOND = 0.05  # of the strongest direction: a single waveform of any source has but one
+CHANCE = 0.01  # that errors of sensors look like it: of three, they have but one direction outside
 CLEARLY = 5.0  # times the variance of any other direction, where the noise is not known
 BEYOND_CHANCE = 5.0  # standard deviations of the white noise's own variance
 MOST = 0.5  # of what is left above the white noise
@@ -33,7 +34,8 @@ def gradient_share(state: State, position: Array | None) -> float:
 
     Returns
     -------
-    Within 0 and 1; 0 where the array cannot tell, where one waveform would do, where other directions hold too much.
+    Within 0 and 1; 0 where the array cannot tell, where one waveform would do, where other directions hold too much,
+    or no less than they would by chance.
     Where they hold less than white noise does, a sensor's noise is not what it was taken for, and the share has to be
     clear without it.
     """
@@ -57,7 +59,26 @@ def gradient_share(state: State, position: Array | None) -> float:
         return 0.0
     if each_outside > MOST_OUTSIDE * each_inside or inside[-2] < LEAST_SECOND * inside[-1]:
         return 0.0
+    excess = min(each_outside, 0.0)  # that the noise was taken for
+    outside = (most - held) * (each_outside - excess) + (white + excess) * np.sqrt(2.0 * (most - held) / n)
+    strengths = np.maximum(inside - excess, 0.0)
+    if _by_chance(outside / (outside + strengths.sum()), strengths, most - held, held) > CHANCE:
+        return 0.0
     return min(of_gradient / total, 1.0)
+
+
+def _by_chance(outside: float, strengths: Array, others: int, held: int) -> float:
+    """Probability that waveforms which add to the sensors in any proportion leave no larger a share of their variance
+    outside of some directions: that of as many of one strength, each of which has Beta(others / 2, held / 2) there.
+
+    Parameters
+    ----------
+    outside: the share; strengths: variances of the waveforms; others, held: directions outside and inside.
+    """
+    from scipy.special import betainc
+
+    waveforms = float(strengths.sum() ** 2 / (strengths @ strengths))
+    return float(betainc(waveforms * others / 2.0, waveforms * held / 2.0, outside))
 
 
 def only_of_a_gradient(state: State, position: Array | None, left: Residual, coefficients: int) -> bool:
