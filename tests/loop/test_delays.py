@@ -108,6 +108,22 @@ def test_of_three_sensors_filters_are_named_where_the_samples_are_too_far_apart_
     assert {one["error_model"], *one["indistinguishable_from"]} >= {"bandwidth", "sampling_lag"}
 
 
+@pytest.mark.parametrize("tau_s", [0.05, pytest.param(0.1, marks=pytest.mark.long)])
+def test_a_filter_of_one_axis_is_no_conductor(tau_s: float, tmp_path: Path) -> None:
+    """Hundreds of nT, of which the search for the filter's time constant finds a local best: at the conductor's it does
+    as well. What the filter held before the first sample nobody knows."""
+    turning = {"type": "tumbling", "duration_s": 200.0, "rate_rms_deg_s": 20.0, "rate_time_s": 4.0}
+    filtered = {"type": "bandwidth", "tau_s": [[0.0] * 3, [tau_s, 0.0, 0.0], [0.0] * 3, [0.0] * 3]}
+    survey = scenario(44, filtered, rate_Hz=20.0, motion=turning)
+    told = verdict_of(tmp_path, survey, models=["sampling_lag", "bandwidth", "eddy_current", "viscous_magnetisation"])
+    (one,) = told["adopted"]
+    assert one["error_model"] == "bandwidth" and "eddy_current" in one["indistinguishable_from"]
+    found = {(c["sensor"], c["name"]): c["value"] for c in one["coefficients"]}
+    assert found.pop(("S2", "x")) == pytest.approx(tau_s, rel=0.01)
+    assert max(abs(value) for value in found.values()) < 1e-3 * tau_s
+    assert "popcorn" not in told["unexplained"]["description"]
+
+
 @pytest.mark.long
 def test_a_second_survey_is_brought_back_to_its_time(tmp_path: Path) -> None:
     """As if nothing were late, but for the last sample, which has not been recorded."""

@@ -8,7 +8,7 @@ from magtensor.calibration.types import Array, Mask
 from magtensor.error_models.excitation import Excitation
 from magtensor.in_a_row import in_a_row
 from magtensor.loop.evidence.own_noise import OwnNoise
-from magtensor.loop.fitting.model import Record, State, unread
+from magtensor.loop.fitting.model import Adopted, Record, State, unread
 from magtensor.loop.fitting.refit import everywhere
 from magtensor.loop.remainder.sparse_readings import SparseReadings, as_far_as_unread, between_readings
 from magtensor.loop.remainder.switches import switched_at
@@ -16,6 +16,8 @@ from magtensor.loop.remainder.switches import switched_at
 LONGEST_SPIKE = 2  # samples: what lasts longer is no accident of the recording
 MANY_FLAGGED = 0.01  # of the samples: of what is left, some is in these
 HYSTERESIS = "hysteresis"
+FILTERS = ("bandwidth", "eddy_current")
+DIED_AWAY = 7.0  # time constants, in which a thousandth is left
 ALIKE = 0.1  # of the mean square along the field, across it: an effect on each sensor shows as much in both
 APART = 3.0  # times the white noise of a sensor: a part in which they are not alike
 AT_AN_END = 0.95  # of the other samples have smaller, or larger, values on average
@@ -49,25 +51,30 @@ def after_pauses(bad: Mask, x: Excitation) -> tuple[Mask, str]:
     return starts, f"; they come first after {found} of {pauses} pauses: something has not come to rest then"
 
 
-def before_the_play(bad: Mask, state: State) -> tuple[Mask, str]:
-    """(N,) bad samples that a survey begins with, while the play of an adopted hysteresis still shows what it began
-    with, which nobody knows, and this in words; none, and "", otherwise."""
-    x, out = state.excitation, np.zeros(len(bad), dtype=bool)
+def before_the_memory(bad: Mask, state: State) -> tuple[Mask, str]:
+    """(N,) bad samples that a survey begins with, while what an adopted hysteresis, or a filter, began with still
+    shows, which nobody knows, and this in words; none, and "", otherwise."""
+    x, none = state.excitation, np.zeros(len(bad), dtype=bool)
     end = int(np.argmin(bad)) if not bad.all() else len(bad)
-    for model in state.adopted:
-        if model.name != HYSTERESIS or not end:
-            continue
-        own = [i for i, name in enumerate(x.sensors) if name in (model.sensors or x.sensors)]
-        output = x.output[:end, own].reshape(end, -1)
-        swept = np.maximum.accumulate(output) - np.minimum.accumulate(output)
-        if (swept[max(end - LONGEST_SPIKE, 0)] < 2.0 * float(model.settings["half_width_nT"])).any():
-            out[:end] = True
-    if not out.any():
-        return out, ""
-    return out, (
-        f"{end} samples at the start, in which the state that {HYSTERESIS} began with still shows, are flagged and "
+    name = next((model.name for model in state.adopted if end and _remembers(model, end, x)), "")
+    if not name:
+        return none, ""
+    return np.arange(len(bad)) < end, (
+        f"{end} samples at the start, in which the state that {name} began with still shows, are flagged and "
         "have no part in the calibration"
     )
+
+
+def _remembers(model: Adopted, end: int, x: Excitation) -> bool:
+    """Whether what a model had seen before the survey may still show just before a sample."""
+    last = max(end - LONGEST_SPIKE, 0)
+    if model.name == HYSTERESIS:
+        own = [i for i, name in enumerate(x.sensors) if name in (model.sensors or x.sensors)]
+        output = x.output[: last + 1, own].reshape(last + 1, -1)
+        return bool((np.ptp(output, axis=0) < 2.0 * float(model.settings["half_width_nT"])).any())
+    if model.name not in FILTERS:
+        return False
+    return bool(x.elapsed[last] <= DIED_AWAY * float(model.settings["tau_s"]))
 
 
 def unread_words(state: State, record: Record) -> list[str]:

@@ -7,12 +7,13 @@ shortens the mean of the sensors. What that leaves would speak against the true 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
-from magtensor.error_models.settings import profiled
+from magtensor.error_models.settings import Range, profiled
 from magtensor.error_models.terms import Terms
 from magtensor.errors import DataError
 from magtensor.loop.evidence.assessment import Assessment, assess, colours_of
@@ -39,29 +40,52 @@ def at_their_own_fit(candidates: Sequence[Candidate], record: Record, state: Sta
     if large:
         least = AS_MUCH * max(c.assessment.gain.total for c in candidates)
         large = [c for c in candidates if c in large or (c.significant and c.assessment.gain.total > least)]
-    each_with = [[c, *plainer_forms(c, state)] for c in large]
-    tried = [c for several in each_with for c in several]
+    best = max(large, key=lambda c: c.assessment.gain.total, default=None)
+    each_with = [([c, *as_set_in(best, c, state)], plainer_forms(c, state)) for c in large if best is not None]
+    tried = [c for itself, below in each_with for c in (*itself, *below)]
     judged = iter(shared_out(lambda c: _judged(c, record, state, how), tried))
     again = {}
     for several in each_with:
-        own = [None if (found := next(judged)) is None else _there(c, found, state) for c in several]
-        if own[0] is not None:
-            again[id(several[0])] = _lowest(own[0], [c for c in own[1:] if c is not None], state)
+        itself, below = ([_there(c, found, state) for c in forms if (found := next(judged))] for forms in several)
+        if itself:
+            own = max(itself, key=lambda c: c.assessment.gain.total)
+            again[id(several[0][0])] = _lowest(own, below, state)
     return sorted((again.get(id(c), c) for c in candidates), key=lambda c: -c.assessment.gain.total)
+
+
+def as_set_in(best: Candidate, candidate: Candidate, state: State) -> list[Candidate]:
+    """The same model with a setting of the best one that it shares, a time constant say: the search for its own, where
+    the fit without either is far off, may have ended elsewhere."""
+    grids, theirs = profiled(candidate.model.component), profiled(best.model.component)
+    shared = {
+        name: best.model.settings[name]
+        for name, grid in grids.items()
+        if isinstance(grid, Range) and isinstance(theirs.get(name), Range)
+        and grid.low <= best.model.settings[name] <= grid.high
+        and best.model.settings[name] != candidate.model.settings[name]
+    }  # fmt: skip
+    return [_with_settings(candidate, shared, state)] if shared else []
 
 
 def plainer_forms(candidate: Candidate, state: State) -> list[Candidate]:
     """The same model in every plainer form that explains something before it is fitted: a delay of all axes alike may
     be nothing that the lengths of one sensor's field show, and a fit of it would go anywhere."""
-    model, residual, below = candidate.model, state.residual, []
-    for settings in plainer(model.settings, profiled(model.component)):
-        lower = replace(model, settings=settings)
-        terms = lower.terms(state.excitation).at(residual.samples)
-        now = Whitened.of(residual, state.colours.across, state.colours.along, state.terms)
-        assessment = assess(now, terms, once=happens_once(model))
-        if assessment.estimate.explained_beside(len(assessment.theta) - terms.count) > SEPARATION:
-            below.append(replace(candidate, model=lower, terms=terms, assessment=assessment))
-    return below
+    forms = (
+        _with_settings(candidate, settings, state)
+        for settings in plainer(candidate.model.settings, profiled(candidate.model.component))
+    )
+    return [
+        form for form in forms
+        if form.assessment.estimate.explained_beside(len(form.assessment.theta) - form.terms.count) > SEPARATION
+    ]  # fmt: skip
+
+
+def _with_settings(candidate: Candidate, settings: Mapping[str, Any], state: State) -> Candidate:
+    """A candidate with other settings, assessed where nothing is fitted yet."""
+    model = replace(candidate.model, settings={**candidate.model.settings, **settings})
+    terms = model.terms(state.excitation).at(state.residual.samples)
+    now = Whitened.of(state.residual, state.colours.across, state.colours.along, state.terms)
+    return replace(candidate, model=model, terms=terms, assessment=assess(now, terms, once=happens_once(model)))
 
 
 def _there(candidate: Candidate, found: tuple[State, Terms, Assessment], state: State) -> Candidate:

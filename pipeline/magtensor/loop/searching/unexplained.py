@@ -25,7 +25,7 @@ from magtensor.loop.remainder.flagged import (
     ALIKE,
     MANY_FLAGGED,
     after_pauses,
-    before_the_play,
+    before_the_memory,
     flagged_words,
     lasting,
     unread_words,
@@ -42,6 +42,7 @@ from magtensor.loop.remainder.tones import channels_of_the_line, of_the_turning
 from magtensor.loop.remainder.turned_too_far import turned_too_far_words
 from magtensor.loop.remainder.with_the_field import with_the_field
 from magtensor.loop.searching.found import Search
+from magtensor.loop.searching.gates import SECOND_ORDER, explained_by
 from magtensor.loop.searching.latent import LEFT_BY_LAWS, shared_words
 from magtensor.loop.searching.like_a_station import (
     channels_of_the_total_field,
@@ -67,14 +68,15 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
     sparse = sparse_readings(state, record)
     bad = disturbed(record, state, found.how)
     starts, paused = after_pauses(bad, state.excitation)
-    played, began = before_the_play(bad, state)
-    flagged = lasting(bad, played) | starts
+    unknown_yet, began = before_the_memory(bad, state)
+    flagged = lasting(bad, unknown_yet) | starts
     loud = Loud.of(state, record, found.how)
-    suspects = Suspects.of(found, flagged, played, sparse, loud.stretches, _seen_alike(state.residual))
+    suspects = Suspects.of(found, flagged, unknown_yet, sparse, loud.stretches, _seen_alike(state.residual))
     outlying = Outlying.of(state, record)
     too_often, theirs = outlying_words(outlying, ~np.asarray(state.fit.keep))
     shows = _what_shows(found, record, excess, sparse)
-    words = [*shows, *([] if shows else popcorn_words(state)), *suspects.words, *too_often]
+    jumps = [] if shows or _of_second_order(state) else popcorn_words(state)
+    words = [*shows, *jumps, *suspects.words, *too_often]
     band = None if words else limited_band(state.residual)
     times = _slow(state, record) / state.residual.scale
     if not words and (times if band is None else band.slow) > NO_NOISE:
@@ -101,7 +103,7 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
         words.insert(0, size if excess else "no larger than the white noise in sum, but of a shape that noise has not")
     beside += [sparse.words] if sparse is not None else suspects.noise_words
     beside += [*suspects.small_words, *([began] if began else [])]
-    beside += spike_words(outlying, bad & ~(lasting(bad) | starts | played | theirs))
+    beside += spike_words(outlying, bad & ~(lasting(bad) | starts | unknown_yet | theirs))
     if record.absent:
         beside.append(f"not searched, for most of the survey lacks it: {', '.join(record.absent)}")
     if flagged.any():
@@ -167,6 +169,13 @@ def _what_shows(found: Search, record: Record, excess: float, sparse: SparseRead
                 cause += f"; it follows {' and '.join(names)}"
         words.append(f"{slow:.3g} nT rms of |b| - F, {where}, is no white noise{cause}")
     return words
+
+
+def _of_second_order(state: State) -> bool:
+    """Whether what is left above the white noise is no more than the next order of what is adopted may be."""
+    residual = state.residual
+    above = (residual.square() - 1.0) * len(residual.affine) * residual.freedom
+    return above < SECOND_ORDER * explained_by(state, range(len(state.adopted)))
 
 
 def _left_by_a_law(found: Search, record: Record) -> list[str]:
