@@ -115,3 +115,16 @@ def test_a_bend_is_where_any_of_the_axes_was_twice() -> None:
     never = np.full(1000, 3.0)
     assert bends_of(np.column_stack([there, never]), 6) == (0.5, 1.0)
     assert bends_of(there, 4) == (0.25, 0.5, 0.75)
+
+
+@pytest.mark.parametrize("seed", [6, *(pytest.param(seed, marks=pytest.mark.long) for seed in (8, 10))])
+def test_an_axis_that_bends_near_its_largest_output(seed: int) -> None:
+    """A fifteenth of the samples or less, in stretches, which fit nothing else, by up to 45 nT."""
+    record = synthetic(seed, 1500, turning_s=8.0)
+    raw = record.raw.copy()
+    raw[:, 0, 0] -= 0.01 * np.maximum(raw[:, 0, 0] - 45_000.0, 0.0)
+    last = found(replace(record, raw=raw)).last
+    (one,) = last.adopted
+    assert one.component.name.startswith("nonlinearity") and one.sensors == ("S1",)
+    assert min(abs(bend - 45_000.0) for bend in one.settings["bends"]) < 300.0
+    assert last.fit.keep.mean() > 0.995 and last.residual.square() < 1.1

@@ -142,9 +142,13 @@ def by_any_law_of(channel: str, state: State, models: Sequence[Component], alpha
 
 def at_an_end(state: State) -> list[str]:
     """The channels with one value that are at an end of their range where samples fit nothing, if these are more than a
-    few: there something may act that does so nowhere else."""
-    wrong = ~np.asarray(state.fit.keep)
-    return [n for n, values in state.excitation.logged.items() if end_of(values, wrong)] if wrong.sum() > ABOUT else []
+    few, and `OUTPUTS` where what an axis reads is: there something may act that does so nowhere else."""
+    wrong, x = ~np.asarray(state.fit.keep), state.excitation
+    if wrong.sum() <= ABOUT:
+        return []
+    read = np.abs(x.output.reshape(len(x.time), -1).T)
+    ends = [name for name, values in x.logged.items() if end_of(values, wrong)]
+    return [*ends, *([OUTPUTS] if any(end_of(values, wrong) == "largest" for values in read) else [])]
 
 
 def outdone_by(chosen: Candidate, state: State) -> str:

@@ -186,7 +186,7 @@ class Rounds:
                 continue
             shared = sought(state, record)
             kept = self.by_its_channel(record, standing, shared, how, open_)
-            if kept.standing is None and (ends := at_an_end(state)):
+            if kept.standing is None and (ends := at_an_end(settled(record, state, how))):
                 curves = [c for channel in ends for c in self.curves_of(channel, state)]
                 kept = self.first_kept(record, standing, curves, how, open_, with_others=False)
             if kept.standing is None and by_what_they_read(state).any():
