@@ -57,7 +57,7 @@ def test_look_adopt_look_again_undo(explorer: Explorer) -> None:
     assert ranking.index[0] in ("current_field", "channel_response")
     assert ranking.loc["current_field", "passes"]
     told = explorer.adopt("current_field")
-    assert "passes the first two gates" in told
+    assert "significant, and predicts held-out blocks" in told
     assert rms(explorer) < 1.5 * NOISE_NT < before / 3
     assert not explorer.left_over()["present"]
     assert explorer.undo() == "adopt current_field"
@@ -77,11 +77,11 @@ def test_the_result_says_who_did_what_and_can_be_made_again(tmp_path: Path, expl
     verdict = json.loads((tmp_path / "out" / "verdict.json").read_text())
     adopted = {a["error_model"]: a for a in verdict["adopted"]}
     assert {n: a["by"] for n, a in adopted.items()} == {"offset_drift": "person", "current_field": "loop"}
-    assert "does not pass the gates of the loop: not significant" in adopted["offset_drift"]["evidence"]["judged"]
+    assert "not adopted by the loop: not significant" in adopted["offset_drift"]["evidence"]["judged"]
     assert adopted["offset_drift"]["settings"]["order"] == 1
     by_hand = [r for r in verdict["rejected"] if r["by"] == "person"]
     assert [r["error_model"] for r in by_hand] == ["channel_response"]
-    assert "passes the first two gates" in by_hand[0]["why"]
+    assert "significant, and predicts held-out blocks" in by_hand[0]["why"]
     assert [d["decision"] for d in verdict["decisions"]] == [
         "reject channel_response", "adopt offset_drift order=1", "loop",
     ]  # fmt: skip
@@ -205,7 +205,7 @@ def test_what_the_calibration_has_already_is_refused(tmp_path: Path, explorer: E
     words = explorer.left_over()["description"]  # the loop has not run: what the ranking lets pass is of use
     passing = {str(n) for n, row in explorer.ranking().iterrows() if row["passes"]}
     assert passing
-    of_use = words.split("significant, passes the first two gates of the loop and is not adopted: ")[1].split("; ")[0]
+    of_use = words.split("significant, predicts held-out blocks and is not adopted: ")[1].split("; ")[0]
     assert passing & {each.split(" at ")[0] for each in of_use.split(", ")}
     if "of no use on held-out blocks: " in words:
         useless = words.split("of no use on held-out blocks: ")[1].split("; ")[0].split(", ")

@@ -111,7 +111,7 @@ def test_where_what_is_slow_goes_furthest_is_no_spike() -> None:
     left_out[31::120] = True
     left_out[33::120] = True
     (words,) = spike_words(found, left_out)
-    assert words.startswith("single samples: 30 samples") and "on S3, hardly further off than those beside" in words
+    assert words.startswith("single samples: 30 samples") and "on S3, and their neighbours are off nearly" in words
 
 
 def test_spikes_of_the_total_field_are_no_sensors() -> None:

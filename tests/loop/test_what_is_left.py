@@ -57,7 +57,9 @@ def test_slow_noise_of_one_sensor_is_told_where_the_others_hide_it_in_the_sum() 
     record = synthetic(6, added=added, samples=2400)
     told = unexplained(search(record, [], Fitting()), record)
     assert not told["present"]
-    amount = re.fullmatch(rf"{NOISE}; not white, as a vector: ([\d.]+) nT rms on S3", told["description"])
+    amount = re.fullmatch(
+        rf"{NOISE}; not white, in the components of the field: ([\d.]+) nT rms on S3", told["description"]
+    )
     # three quarters of its power lie across the plane of the field that all sensors see, before C takes its share
     assert amount and float(amount[1]) == pytest.approx(2.0 * np.sqrt(0.75), rel=0.15)
 

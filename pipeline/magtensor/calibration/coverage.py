@@ -160,8 +160,9 @@ class Coverage:
             found.append(
                 f"no ellipsoid comes nearer to the samples than {self.distance:.3g} nT rms"
                 if self.scattered
-                else f"a second quadric surface passes within {self.second_distance:.3g} nT of the samples "
-                f"(more than {self.required_distance:.3g} nT is needed to tell it from noise)"
+                else "a second quadric surface, which stands for another calibration, passes within "
+                f"{self.second_distance:.3g} nT of the samples (beyond {self.required_distance:.3g} nT they would tell "
+                "the two apart)"
             )
         elif self.worst_error > self.accepted_error:
             found.append(

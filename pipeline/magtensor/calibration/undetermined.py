@@ -75,7 +75,7 @@ class Undetermined:
         if self.combinations:
             said += (
                 f"; {self.combinations} of {self.of} combinations of scale factors, axis directions and offsets are "
-                "what was assumed"
+                "known no better than was assumed"
             )
         return said
 

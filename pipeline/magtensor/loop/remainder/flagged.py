@@ -143,7 +143,7 @@ def flagged_words(
             return f"{words}; they lie between readings of the base station", True
     if amount > FAR * usual:
         return words, False
-    return f"{words}; slow noise, of {usual:.3g} nT rms there, may go as far", True
+    return f"{words}; slow noise, {usual:.3g} nT rms there, may reach as far by itself", True
 
 
 def _as_unread(away: Array, flagged: Mask, record: Record) -> bool:

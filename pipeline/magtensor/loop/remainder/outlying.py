@@ -140,7 +140,7 @@ def spike_words(found: Outlying, spikes: Mask) -> list[str]:
     theirs = at[worst < len(names)]
     by_themselves = not len(theirs) or np.mean(np.any(found.wrong[theirs], axis=1)) > 0.5
     what, as_others = (
-        ("spikes", "") if by_themselves else ("single samples", ", hardly further off than those beside them")
+        ("spikes", "") if by_themselves else ("single samples", ", and their neighbours are off nearly as far")
     )
     return [
         f"{what}: {count} samples ({count / len(spikes):.1%}) fit no calibration, by {np.median(size):.3g} nT in "

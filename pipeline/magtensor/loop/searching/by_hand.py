@@ -147,7 +147,7 @@ def pinned(component: Component, settings: Mapping[str, Any]) -> Component:
 
 def judged(candidate: Candidate) -> str:
     """What the loop's gates say of a candidate."""
-    gates = "passes the first two gates of the loop" if candidate.passes else "does not pass the gates of the loop"
+    gates = "significant, and predicts held-out blocks" if candidate.passes else "not adopted by the loop"
     return f"{gates}: {why(candidate, None)}"
 
 

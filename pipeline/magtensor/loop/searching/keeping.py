@@ -37,7 +37,7 @@ from magtensor.loop.searching.one_direction import VISCOUS, of_one_direction
 from magtensor.loop.searching.profiling import already
 from magtensor.loop.searching.rivals import hardly_begun
 
-NOT_AS_ASSUMED = "fitted, its coefficients are not what its settings assume"
+NOT_AS_ASSUMED = "fitted, its coefficients are none that its law allows"
 ONE_OF_A_KIND = "fitted, it comes out the same as one that is adopted already"  # its law is no single one
 MOST_OF_DIFFERENCES = 0.1  # positions wrong by a tenth of the array, where its law ends to be of first order
 MAYBE_HEAT = (

@@ -144,7 +144,8 @@ def _of_what_wanders(found: Search, state: State, places: Sequence[int]) -> str:
     if not happens_once(state.adopted[places[0]]):
         return ""
     more = [c.model.name for c in last if happens_once(c.model) and unlikely(c) and not c.passes]
-    return f"is no lone event ({' and '.join(more)} beside it would predict nothing)" if more else ""
+    others = f"{' and '.join(more)} beside it would be significant, and predict nothing"
+    return f"is not the only such event ({others})" if more else ""
 
 
 def of_nothing(state: State, fixed: int) -> tuple[list[int], str] | None:

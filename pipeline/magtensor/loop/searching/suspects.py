@@ -105,9 +105,7 @@ class Suspects:
         """Those that make something unexplained."""
         words = []
         if self.open:
-            words.append(
-                f"significant, passes the first two gates of the loop and is not adopted: {', '.join(self.open)}"
-            )
+            words.append(f"significant, predicts held-out blocks and is not adopted: {', '.join(self.open)}")
         if self.useless:
             words.append(f"significant but of no use on held-out blocks: {', '.join(self.useless)}")
         return words

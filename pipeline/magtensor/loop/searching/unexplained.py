@@ -100,7 +100,7 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
     if words:
         in_use = " at the samples in use" if bad.mean() > MANY_FLAGGED else ""
         size = f"{excess:.3g} nT rms above the white noise{in_use}, {_where(state)}"
-        words.insert(0, size if excess else "no larger than the white noise in sum, but of a shape that noise has not")
+        words.insert(0, size if excess else "in all no more than white noise leaves, but not at random")
     beside += [sparse.words] if sparse is not None else suspects.noise_words
     beside += [*suspects.small_words, *([began] if began else [])]
     beside += spike_words(outlying, bad & ~(lasting(bad) | starts | unknown_yet | theirs))
@@ -219,7 +219,7 @@ def noise_words(state: State, record: Record, band: Band | None) -> list[str]:
             each = zip(sensors, np.sqrt(np.maximum(_beyond_white(residual), 0.0)), axis, strict=True)
             slower = [f"{slow:.2g} nT rms on {name}" for name, slow, least in each if slow > least]
             if 0 < len(slower) < len(sensors):
-                words.append(f"not white, as a vector: {', '.join(slower)}")
+                words.append(f"not white, in the components of the field: {', '.join(slower)}")
     if (slow := slow_along(state)) > white:
         station = of_the_station(state, record)
         makes = "may make all" if station > slow else f"makes {station:.2g} nT"  # known from how its readings scatter
