@@ -19,6 +19,7 @@ from magtensor.units import TEMPERATURE, UNITS, convert
 from magtensor_stages.faults import refuse_faults
 
 BY = "load"
+LEFT_BEHIND = "repeats its reading while other sensors go on"
 _READ_TOGETHER = 0.5  # of the readings of the sensor that has the fewest
 
 
@@ -63,9 +64,9 @@ def load(
 
     Refused: times that do not increase, an axis without signal, a sensor that is stuck, two axes or two stretches with
     the same numbers, magnitudes that betray wrong units, more flagged samples than allowed. Flagged: missing and
-    infinite values, saturation, runs in which a sensor repeats itself. No calibration is fitted to rows that repeat a
-    reading or lie on the line between two, in a recording faster than its sensors. Reported with the variables:
-    sampling, quantisation.
+    infinite values, saturation, runs in which a sensor repeats itself, rows in which one does now and then while others
+    go on. No calibration is fitted to rows that repeat a reading or lie on the line between two, in a recording faster
+    than its sensors. Reported with the variables: sampling, quantisation.
     """
     if survey.source is None:
         raise UsageError("load: the recipe has no `survey` section, and no survey was named on the command line")
@@ -98,6 +99,11 @@ def load(
                 hint=f"load allows max_flagged_share {max_flagged_share:g}; `sensors` can leave the sensor out",
             )
     given = _readings(found, notes)
+    if "is_reading" in given:
+        late = repeated.left_behind(found.values("b_raw"), given["is_reading"][1])
+        for s, name in enumerate(found.sensors):
+            flags += flag_ranges(found.time, late[:, s] & good[:, s], by=BY, reason=LEFT_BEHIND, sensor=name)
+        good = good & ~late
     attributes = {**found.attributes, **({"notes": notes} if notes else {})}
     loaded = replace(found, attributes=attributes, source=survey.source)
     given["good"] = (("time", "sensor"), good, {"long_name": "may be used"})

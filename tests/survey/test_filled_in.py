@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from test_load import Load, Variables, changed
 
-from magtensor.survey.repeated import filled_in
+from magtensor.survey.repeated import filled_in, left_behind
 
 
 def turning(samples: int, noise_nT: float, seed: int = 3, step_s: float = 0.01) -> np.ndarray:
@@ -112,3 +112,22 @@ def test_sensors_that_are_read_in_turn_are_all_used(load_variables: Load, variab
     survey = load_variables(changed(variables, "b_raw", lambda _: field))
     assert survey.readings.all()
     assert "the sensors are read in different rows" in survey.attributes["notes"][0]
+
+
+def test_a_sensor_that_now_and_then_repeats_a_row_is_left_behind() -> None:
+    """What it says is wrong by what the platform turned since; a sensor of half the rate always does, and is kept."""
+    rng = np.random.default_rng(8)
+    field = np.stack([turning(1000, 1.0, seed) for seed in (1, 2, 3)], axis=1)
+    again = rng.random(1000) < 0.15
+    again[0] = False
+    sticking, slow = field.copy(), field.copy()
+    for row in np.flatnonzero(again):
+        sticking[row, 1] = sticking[row - 1, 1]
+    slow[1::2, 1] = slow[:-1:2, 1]
+    for given, expected in ((sticking, again), (slow, np.zeros(1000, dtype=bool)), (field, np.zeros(1000, dtype=bool))):
+        reading = ~np.column_stack([filled_in(given[:, s]) for s in range(3)])
+        found = left_behind(given, reading)
+        assert not found[:, [0, 2]].any()
+        assert (found[1:-1, 1] == expected[1:-1]).all()
+    together = np.repeat(sticking[again, 1][:, None], 3, axis=1)  # all repeat at once: a recording faster than they are
+    assert not left_behind(together, np.zeros(together.shape[:2], dtype=bool)).any()

@@ -12,6 +12,7 @@ from magtensor.survey.recorded_numbers import Bools, Floats, believable_run, noi
 SINGLE_PRECISION, DOUBLE_PRECISION = 2e-7, 1e-12
 LEAST_FILLED_IN, MOST_FILLED_IN = 0.05, 0.96  # of the rows
 NEARLY_ALL = 0.8  # of the rows that are alike on all axes
+NOW_AND_THEN = 0.4  # of the rows at most: a sensor of half the rate repeats in every other one
 LEAST_CHANGES, LEAST_HELD_ROWS = 5, 2.5  # of a series that repeats its readings; rows from one to the next
 LEAST_STUCK = 2.0  # rows alike on all axes that are no fault, whatever other sensors do meanwhile
 UNLIKELY_GRID = 1e-8  # that the changes of other series lie on a regular grid
@@ -161,6 +162,19 @@ def filled_in(field: Floats) -> Bools:
     none[1:-1] = alike.all(axis=1)
     none[-1] = (field[-1] == field[-2]).all()
     return none
+
+
+def left_behind(field: Floats, reading: Bools) -> Bools:
+    """(N, S) True where a sensor repeats its reading, which it does now and then only, while another one goes on: what
+    it says is a row old. A sensor that is slower than the recording does so all the time, and is no fault.
+
+    Args:
+        field: (N, S, 3) nT.
+        reading: (N, S) rows with a reading of their own.
+    """
+    again = ~reading & reading.any(axis=1, keepdims=True)
+    again[1:] &= (field[1:] == field[:-1]).all(axis=2)
+    return np.asarray(again & (again.mean(axis=0) < NOW_AND_THEN))
 
 
 def _last_digit(field: Floats) -> float:
