@@ -127,4 +127,5 @@ def test_an_axis_that_bends_near_its_largest_output(seed: int) -> None:
     (one,) = last.adopted
     assert one.component.name.startswith("nonlinearity") and one.sensors == ("S1",)
     assert min(abs(bend - 45_000.0) for bend in one.settings["bends"]) < 300.0
+    assert len(one.settings["bends"]) <= 2  # one, and what chance may ask for
     assert last.fit.keep.mean() > 0.995 and last.residual.square() < 1.1

@@ -198,7 +198,15 @@ def _by_a_curve(
     gains = [fold_gain(base, colours, terms) for terms in every]
     best = max(gains, key=lambda gain: gain.total)
     chosen = max(k for k, gain in enumerate(gains) if not separated(best, gain))
-    moved = curve(_moved(base, curve, asked_for[chosen], float(np.ptp(column)) / FINEST))
+    spacing = float(np.ptp(column)) / FINEST
+    bends = _moved(base, curve, asked_for[chosen], spacing)
+    while len(bends) > 1:  # where each explains most two of them may be one
+        fewer = _moved(base, curve, _without_the_least(base, curve, bends), spacing)
+        here, there = (fold_gain(base, colours, curve(b).terms(x).at(state.residual.samples)) for b in (bends, fewer))
+        if separated(here, there):
+            break
+        bends = fewer
+    moved = curve(bends)
     moved = replace(moved, settings={**moved.settings, name: tuple(sorted(moved.settings[name]))})
     found = _assessed(state, moved, tried * comb(len(options), len(asked_for[chosen])), alpha).among(models)
     return found if found.passes else None
@@ -266,6 +274,16 @@ def _moved(
 
         here[k] = golden(gain, here[k] - spacing, here[k] + spacing, here[k])
     return here
+
+
+def _without_the_least(state: State, curve: Callable[[Sequence[float]], Adopted], bends: list[float]) -> list[float]:
+    """The bends of a curve without that which explains least."""
+    few, (residual, given) = Thinned.of(state, REFINING_SAMPLES), thinned(state, REFINING_SAMPLES)
+    every = few.of_model(curve(bends))
+    each = every.count - few.of_model(curve(bends[:-1])).count
+    together = every if given is None else joined([given, every])
+    whole = estimated(residual, together, likeliest(residual, together, [colours_of(residual), WHITE]).colours)
+    return _fewer_and_fewer(whole, bends, each)[1]
 
 
 def _fewer_and_fewer(whole: Estimate, bends: list[float], each: int) -> list[list[float]]:
