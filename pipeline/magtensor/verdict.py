@@ -155,6 +155,8 @@ def _with_its_channel(a: Mapping[str, Any]) -> str:
     channel, others = settings.get("channel"), a.get("channels_as_good", [])
     if channel and (name.startswith("channel_") or others):
         name = f"{name} of {channel}" + (f" (or of {' or '.join(others)})" if others else "")
+    elif others:
+        name = f"{name} (or channel_response of {' or '.join(others)})"
     if like := a.get("most_like_channel"):
         name = f"{name} (most like channel {like})"
     if means := a.get("means"):

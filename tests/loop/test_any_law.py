@@ -278,3 +278,38 @@ def test_a_drift_is_no_curve_of_what_falls_meanwhile(seed: int) -> None:
     last = found(gained(seed, 2e-4 * part + 1e-4 * part**2, sagging(seed)), *GAINS).last
     assert [a.name for a in last.adopted] == ["scale_drift"]
     assert last.residual.square() < 1.1
+
+
+ASCENT = ("offset_drift", "offset_step", "channel_response")
+
+
+def climbing(seed: int, course: Array) -> Record:
+    """A survey on an ascent, in which the first sensor's offset follows a course (N,), with the pressure logged."""
+    pressure = 1000.0 - 800.0 * np.linspace(0.0, 1.0, SAMPLES) ** 1.3
+    record = synthetic(seed, SAMPLES)
+    raw = record.raw.copy()
+    raw[:, 0] += np.multiply.outer(course, [1.0, -0.6, 0.8])
+    return replace(record, raw=raw, logged={"pressure": pressure}, units={"pressure": "hPa"}, origins={"pressure": 0.0})
+
+
+def told_of(found: Search) -> list[tuple[str, tuple[str, ...]]]:
+    return [(s.adopted.model.name, s.channels) for s in found.steps if s.adopted is not None]
+
+
+@pytest.mark.parametrize("seed", [90, pytest.param(91, marks=pytest.mark.long)])
+def test_what_went_on_as_time_did_is_named_beside_a_drift_and_no_step_beside_it(seed: int) -> None:
+    """A root of what falls once: a line of time explains most, and of the rest a step some; nothing tells time from the
+    pressure, and one curve of that does what both do."""
+    pressure = climbing(seed, np.zeros(SAMPLES)).logged["pressure"]
+    last = found(climbing(seed, 0.4 * np.sqrt(pressure - 199.0)), *ASCENT)
+    assert told_of(last)[0] == ("offset_drift", ("pressure",))
+    assert "channel_response" in last.steps[0].rivals
+    assert all(name == "offset_drift" for name, _ in told_of(last))
+
+
+@pytest.mark.parametrize("seed", [92, pytest.param(93, marks=pytest.mark.long)])
+def test_a_step_beside_a_drift_is_no_curve_of_what_went_on_meanwhile(seed: int) -> None:
+    """Whose pieces are longer than a step."""
+    part = np.linspace(-1.0, 1.0, SAMPLES)
+    names = [name for name, _ in told_of(found(climbing(seed, 3.0 * part + 2.0 * (part > 0.21)), *ASCENT))]
+    assert sorted(names) == ["offset_drift", "offset_step"]

@@ -152,6 +152,7 @@ def test_what_another_width_of_an_adopted_law_explains_is_no_other_effect(
     monkeypatch.setattr(rounds, "part_of_a_drift", lambda *_: None)
     monkeypatch.setattr(rounds, "beside_time", lambda *_: BesideTime(True))
     monkeypatch.setattr(rounds, "is_a_course", lambda *_: False)
+    monkeypatch.setattr(rounds, "channels_in_time", lambda *_: [])
     monkeypatch.setattr(rounds, "part_of", lambda *_: False)
     monkeypatch.setattr(rounds, "overlaps", lambda c, failed, _: failed is width and c is creep)
     for each in (width, creep, other):
@@ -196,6 +197,7 @@ def test_of_one_name_the_curve_of_another_channel_is_still_tried(monkeypatch: py
         "by_a_worse_log": lambda *_: set(),
         "beside_time": lambda *_: BesideTime(True),
         "is_a_course": lambda *_: False,
+        "channels_in_time": lambda *_: [],
         "outdone_by": lambda chosen, _: "wind" if chosen is line else "",
         "part_of_a_waveform": lambda *_: "",
         "by_any_law_of": curves,

@@ -8,6 +8,7 @@ they explain on blocks that lie between others.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,7 +16,7 @@ import numpy as np
 from magtensor.calibration.types import Array
 from magtensor.error_models.curves import along_a_curve, bends_of
 from magtensor.error_models.excitation import Excitation
-from magtensor.error_models.terms import Terms
+from magtensor.error_models.terms import Terms, joined
 from magtensor.loop.evidence.assessment import Colours
 from magtensor.loop.evidence.gains import interleaved_gain
 from magtensor.loop.evidence.grams import Whitened, grams_in
@@ -67,6 +68,25 @@ def another_curve(state: State, model: Adopted, terms: Terms, theta: Array, colo
     return best if best and gains[best] > known + SEPARATION else ""
 
 
+def as_a_course(state: State, terms: Terms, theta: Array, colours: Colours) -> list[str]:
+    """The channels any curve of which, seen once or more often, explains as much as a course of time does: they go on
+    as time does, and nothing tells which of them it is. Parameters as above."""
+    along = _Along.of(state, terms, theta, colours)
+    return [] if along is None else along.explained_anywhere(along.waveform, state.excitation)
+
+
+def of_one_curve(state: State, models: Sequence[tuple[Terms, Array]], colours: Colours, missed: float) -> str:
+    """The channel any curve of which, seen once or more often, explains as much as several models with coefficients
+    do, but for a part that pieces of it may miss; "" where there is none, or they have no direction in common. The
+    state is without them."""
+    together, theta = joined([terms for terms, _ in models]), np.concatenate([theta for _, theta in models])
+    along = _Along.of(state, together, theta, colours)
+    if along is None:
+        return ""
+    each = [terms.contribution(theta, len(along.direction)) @ along.direction for terms, theta in models]
+    return next(iter(along.explained_anywhere(np.column_stack(each), state.excitation, missed)), "")
+
+
 @dataclass(frozen=True)
 class _Along:
     """The direction at the sensors along which an effect acts, and what series (N, K) explain along it on blocks that
@@ -99,6 +119,13 @@ class _Along:
         every = np.ones(blocks.count, dtype=bool)
         return float(interleaved_gain(blocks, self.white.residual.freedom, given, every).total)
 
+    def explained_anywhere(self, series: Array, x: Excitation, missed: float = 0.0) -> list[str]:
+        """The channels with one value the best curve of which, bending anywhere, explains as much as series do, but for
+        a part."""
+        least = (1.0 - missed) * self.gain(series) - SEPARATION
+        scalars = ((name, values) for name, values in x.logged.items() if not x.is_vector(name))
+        return [name for name, values in scalars if self.best_curve(values, anywhere=True)[0] >= least]
+
     def is_of_a_curve(self, values: Array) -> bool:
         """Whether the best curve of some values explains as much, or leaves less than half of it."""
         gain, curve = self.best_curve(values)
@@ -108,13 +135,15 @@ class _Along:
         beside = self.gain(np.column_stack([curve, self.waveform])) - gain
         return gain > alone - SEPARATION or beside < HALF * alone
 
-    def best_curve(self, values: Array) -> tuple[float, Array | None]:
+    def best_curve(self, values: Array, *, anywhere: bool = False) -> tuple[float, Array | None]:
         """What the best curve of a channel (N,) or (N, S) of all samples explains, and its series; of a constant -inf
-        and None."""
+        and None. It bends `anywhere`, or only at values that the survey had at two times."""
         column = (values if values.ndim == 1 else values.mean(axis=1))[self.white.residual.samples]
         if np.ptp(column) == 0:
             return -np.inf, None
-        curves = [along_a_curve(column, bends_of(column, pieces)) for pieces in PIECES]
+        low, high = float(column.min()), float(column.max())
+        knots = [tuple(np.linspace(low, high, n + 1)[1:-1]) if anywhere else bends_of(column, n) for n in PIECES]
+        curves = [along_a_curve(column, bends) for bends in knots]
         every = [np.column_stack([c for _, c in curve]) for curve in curves]
         return max(((self.gain(series), series) for series in every), key=lambda each: each[0])
 

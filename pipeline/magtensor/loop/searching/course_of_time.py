@@ -24,9 +24,10 @@ from magtensor.error_models.terms import Terms, joined
 from magtensor.loop.evidence.assessment import WHITE, colours_of, estimated, explained
 from magtensor.loop.evidence.residual import Residual, taken_off
 from magtensor.loop.fitting.model import Adopted, State, generic
+from magtensor.loop.remainder.curve_of_a_channel import as_a_course, of_one_curve
 from magtensor.loop.searching.beginnings import beginning, one_pattern
 from magtensor.loop.searching.contribution import happens_once, put_back_one
-from magtensor.loop.searching.gates import Candidate
+from magtensor.loop.searching.gates import OF_THE_LAW, Candidate
 from magtensor.loop.searching.kin import TIME, drivers, explained_by_courses
 from magtensor.loop.searching.profiling import REFINING_SAMPLES, thinned
 from magtensor.loop.searching.rivals import hardly_begun, overlaps
@@ -163,6 +164,29 @@ def responses_like(drift: Candidate, courses: Sequence[Candidate], state: State)
     if not courses or not is_a_course(drift.model, state.excitation):
         return set()
     return {c.model.name for c in courses if overlaps(drift, c, state)}
+
+
+def channels_in_time(drift: Candidate, state: State) -> list[str]:
+    """The channels any curve of which explains as much as a drift does, for they went on as time did; none of what is
+    no drift."""
+    if not is_a_course(drift.model, state.excitation):
+        return []
+    theta = drift.assessment.theta[-drift.terms.count :]
+    return as_a_course(drift.before or state, drift.terms, theta, drift.assessment.colours)
+
+
+def one_curve(event: Candidate, state: State) -> str:
+    """The channel any curve of which explains as much as an adopted drift and an event beside it, in words; "" where
+    there is none."""
+    seen = event.before or state
+    theta, colours = event.assessment.theta[-event.terms.count :], event.assessment.colours
+    for place, model in enumerate(seen.adopted):
+        if is_a_course(model, seen.excitation):
+            own = model.terms(seen.excitation).at(seen.residual.samples)
+            both = [(own, seen.theta[place]), (event.terms, theta)]
+            if channel := of_one_curve(put_back_one(seen, place), both, colours, OF_THE_LAW):
+                return f"a curve of {channel} explains as much as {model.name} and it together"
+    return ""
 
 
 def _followed(model: Adopted, x: Excitation) -> str:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 from magtensor.error_models.waveform import NAME
 from magtensor.loop.fitting.model import Fitting, Record, State
+from magtensor.loop.fitting.refit import settled
 from magtensor.loop.fitting.trial import Trial
 from magtensor.loop.searching.contribution import removal
 from magtensor.loop.searching.gates import Candidate
@@ -67,6 +69,32 @@ class Kept:
         if kept and all(c is not kept for c in told):
             told = (*told, kept)
         return Step(before, told, kept, self.rivals, self.dropped, self.refused, channels=self.channels)
+
+
+@dataclass(frozen=True)
+class Ended:
+    """Where rounds of a search ended: nothing more is adopted.
+
+    Attributes:
+        record: as in `Search`; state: the fit with all that was adopted; how: it was made.
+        steps: in order; shared: the waveform that the sensors share.
+    """
+
+    record: Record
+    state: State
+    how: Fitting
+    steps: tuple[Step, ...]
+    shared: Sought | None
+
+    @cached_property
+    def settled(self) -> State:
+        """The fit without the samples that nothing explains."""
+        return settled(self.record, self.state, self.how)
+
+    @property
+    def adopts(self) -> bool:
+        """Whether anything was adopted."""
+        return any(step.adopted is not None for step in self.steps)
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ from magtensor.loop.searching.contribution import (
     share_of_differences,
     share_of_the_field,
 )
-from magtensor.loop.searching.course_of_time import outweighed
+from magtensor.loop.searching.course_of_time import one_curve, outweighed
 from magtensor.loop.searching.gates import Candidate
 from magtensor.loop.searching.left_out import better_left_out, between_its_flanks
 from magtensor.loop.searching.like_a_station import as_a_station_would, only_a_constant
@@ -182,6 +182,8 @@ def why_not(record: Record, before: Trial, after: Trial, chosen: Candidate, how:
             return f"it lies along the vectors of {name}, whose law may leave it"
         if channel := event_of_a_curve(seen, chosen.terms, theta, chosen.assessment.colours):
             return f"a curve of {channel} explains most of it: what is adopted may miss its law"
+        if why := one_curve(chosen, before.state):
+            return why
         if event_of_an_axis(seen, chosen.terms, theta, chosen.assessment.colours):
             return OF_AN_AXIS
         terms = chosen.terms.only(i for i, s in enumerate(chosen.terms.sensors) if s in acts_on)

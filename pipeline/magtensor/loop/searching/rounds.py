@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 
 from magtensor.components import Component
 from magtensor.error_models.excitation import Excitation
@@ -18,9 +17,15 @@ from magtensor.loop.searching.another_lag import with_another_lag
 from magtensor.loop.searching.any_law import OUTPUTS, at_an_end, by_a_curve, by_any_law, by_any_law_of, outdone_by
 from magtensor.loop.searching.beside_a_hole import of_a_hole
 from magtensor.loop.searching.contribution import eliminate, tones_of, without_models
-from magtensor.loop.searching.course_of_time import beside_time, is_a_course, responses_like, rivals_in_time
+from magtensor.loop.searching.course_of_time import (
+    beside_time,
+    channels_in_time,
+    is_a_course,
+    responses_like,
+    rivals_in_time,
+)
 from magtensor.loop.searching.exchange import exchanged, looked_at_again
-from magtensor.loop.searching.found import Kept, Step
+from magtensor.loop.searching.found import Ended, Kept, Step
 from magtensor.loop.searching.gates import Candidate
 from magtensor.loop.searching.keeping import (
     MAYBE_HEAT,
@@ -63,32 +68,6 @@ from magtensor.loop.searching.which_channel import nearest
 ROUNDING = 1e-4  # mean square of the whitened residual: far below the least noise that any sensor is believed to have
 MOST_BESIDE = 2  # fits of another beside what fails alone: of two that hinder each other each is the first to be seen
 AS_LASTING = "{}, which lasts, predicts as much"
-
-
-@dataclass(frozen=True)
-class Ended:
-    """Where rounds of a search ended: nothing more is adopted.
-
-    Attributes:
-        record: as in `Search`; state: the fit with all that was adopted; how: it was made.
-        steps: in order; shared: the waveform that the sensors share.
-    """
-
-    record: Record
-    state: State
-    how: Fitting
-    steps: tuple[Step, ...]
-    shared: Sought | None
-
-    @cached_property
-    def settled(self) -> State:
-        """The fit without the samples that nothing explains."""
-        return settled(self.record, self.state, self.how)
-
-    @property
-    def adopts(self) -> bool:
-        """Whether anything was adopted."""
-        return any(step.adopted is not None for step in self.steps)
 
 
 @dataclass
@@ -271,7 +250,8 @@ class Rounds:
             chosen, channels = nearest(chosen, before.state, models, anything)
             frequencies = tones_of(chosen.model)
             of_a_tone = [c for f in frequencies for c in channels_of_the_line(x, f)]
-            if same := (*switched, *of_a_tone):
+            in_time = channels_in_time(chosen, before.state)
+            if same := (*switched, *of_a_tone, *in_time):
                 channels, rivals = same, tuple(sorted({*rivals, CHANNEL}))
             time = beside_time(chosen, before.state)
             if time.refused:

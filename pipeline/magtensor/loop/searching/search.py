@@ -24,13 +24,13 @@ from magtensor.loop.fitting.trial import on_the_folds_of, trial
 from magtensor.loop.fitting.wandering import all_noise, narrowed_to, of_sensors, quieter, unweighed
 from magtensor.loop.remainder.flagged import lasting
 from magtensor.loop.searching.contribution import borne_out, eliminate, over_at_once, possible_without
-from magtensor.loop.searching.found import Search, Step
+from magtensor.loop.searching.found import Ended, Search, Step
 from magtensor.loop.searching.gates import ALPHA
 from magtensor.loop.searching.latent import NAME, of_every_sensor, renewed, sought
 from magtensor.loop.searching.on_fewer_sensors import on_those_that_show
 from magtensor.loop.searching.on_more_sensors import in_the_place_of_others
 from magtensor.loop.searching.overshadowed import overshadowed
-from magtensor.loop.searching.rounds import Ended, Rounds, with_lines
+from magtensor.loop.searching.rounds import Rounds, with_lines
 from magtensor.loop.searching.strong_event import begun_with
 
 MOST_EFFECTS = 8
