@@ -77,6 +77,32 @@ def test_gains_of_single_axes_are_told(tmp_path: Path) -> None:
     assert words.startswith("what is left of S2 goes with what each axis reads")
 
 
+def swinging(axes: int) -> Callable[[Path], None]:
+    """S3 swings, by 10 urad within some seconds, about one axis or about three."""
+
+    def change(path: Path) -> None:
+        rng = np.random.default_rng(7)
+        with h5py.File(path, "r+") as survey:
+            raw = survey["b_raw"][:]
+            angle = 1e-5 * np.column_stack([_walk(rng, len(raw), 6.0) for _ in range(axes)])
+            about = np.array([[0.6, -0.64, 0.48]]) if axes == 1 else np.eye(3)
+            raw[:, 2] += np.cross(angle @ about, raw[:, 2])
+            survey["b_raw"][...] = raw
+
+    return change
+
+
+@pytest.mark.parametrize("axes", [1, 3])
+def test_a_mount_that_swings_is_told_with_its_size(axes: int, tmp_path: Path) -> None:
+    """Its turn is all across the field, and noise is along it too."""
+    state = linear_state(loaded(tmp_path, scenario(101), swinging(axes)))
+    (words,) = with_the_field(state, stamps=True)
+    found = re.fullmatch(r"what is left of S3 goes with what it reads, across that, .* by ([\d.]+) mrad rms.*", words)
+    assert found is not None
+    assert float(found[1]) == pytest.approx(1e-2 * np.sqrt(axes), rel=0.3)
+    assert with_the_field(state, stamps=False) == []
+
+
 def test_of_all_sensors_none_is_singled_out(tmp_path: Path) -> None:
     change = flickering(3e-5, (0, 1, 2, 3))
     (words,) = with_the_field(linear_state(loaded(tmp_path, scenario(101), change)), stamps=True)

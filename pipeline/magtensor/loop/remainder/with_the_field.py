@@ -1,9 +1,10 @@
-"""What is left of a sensor that lies along the field it reads, or along its rate of change: noise of an output knows
-neither.
+"""What is left of a sensor that lies along the field it reads, across it, or along its rate of change: noise of an
+output knows none of these.
 
 A gain that changes as nobody logs adds a part of what is read, now more and now less; stamps that are now early and now
-late add a part of its rate. No regressor follows either, but the squares and products of the axes of what is left do
-follow those of what it would be a part of. Of noise, slow or not, they do not, whatever its covariance among the axes.
+late add a part of its rate; a mount that swings adds what is across it. No regressor follows any of them, but the
+squares and products of the axes of what is left do follow those of what it would be a part of. Of noise, slow or not,
+they do not, whatever its covariance among the axes.
 """
 
 from __future__ import annotations
@@ -22,8 +23,10 @@ LEAST_SHARE = 0.25  # of the power of what is left of the sensor: laws of what i
 ALIKE = 0.4  # of the worst sensor's, in each other: of three, one alone makes a quarter of it
 CLEARLY = 1.3  # times the share of an earlier law: one gain of a sensor is three alike as well
 EVERY, EACH_AXIS = np.array([1.0, 1.0, 1.0, 2.0, 2.0, 2.0]), np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
+_PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 GAIN = "what it reads, as if its gain changed by {} rms, which follows no channel"
 GAINS = "what each axis reads, as if its gain changed by {} rms, which follows no channel"
+SWINGS = "what it reads, across that, as if it turned to and fro by {} rms, which follows no channel"
 STAMPS = "how fast the field turns in it, as if its stamps were off by {} rms, now early and now late"
 
 
@@ -34,7 +37,7 @@ class _Law:
     words: str
     unit: str
     size: float
-    vector: Array  # (N, S, 3), over the noise
+    vectors: Array  # (K, N, S, 3), over the noise: of any of which it is a part
     weights: Array  # (6,) of the squares, and of the products, each of which is there twice
 
 
@@ -51,7 +54,7 @@ def with_the_field(state: State, *, stamps: bool) -> list[str]:
 
     Parameters
     ----------
-    stamps: whether the rate is asked for.
+    stamps: whether the rate, and a turn, are asked for.
     """
     from scipy.special import stdtrit
 
@@ -60,9 +63,10 @@ def with_the_field(state: State, *, stamps: bool) -> list[str]:
         return []
     noise, sensors = residual.noise.reshape(-1, 3), len(x.sensors)
     reads, rate = (x.sensed(v)[residual.samples] / noise for v in (x.field, x.rate))
-    laws = [_Law(GAIN, "ppm", 1e6, reads, EVERY), _Law(GAINS, "ppm", 1e6, reads, EACH_AXIS)]
-    laws += [_Law(STAMPS, "ms", 1e3, rate, EVERY)] if x.turns and stamps else []
     left = residual.across.reshape(-1, sensors, 3)
+    laws = [_Law(GAIN, "ppm", 1e6, reads[None], EVERY), _Law(GAINS, "ppm", 1e6, reads[None], EACH_AXIS)]
+    laws += [_Law(STAMPS, "ms", 1e3, rate[None], EVERY)] if x.turns and stamps else []
+    laws += [_Law(SWINGS, "mrad", 1e3, _turned(left, reads, noise), EVERY)] if stamps else []
     least = float(stdtrit(BLOCKS - 1, 1.0 - ALPHA / (len(laws) * sensors)))
     best: tuple[float, _Law, _Found] | None = None
     for law in laws:
@@ -77,7 +81,7 @@ def with_the_field(state: State, *, stamps: bool) -> list[str]:
     worst = int(np.argmax(np.where(found.t > least, found.part, 0.0)))
     alike = sensors > 2 and bool(np.all(found.part > ALIKE * found.part[worst]))
     part = float(np.sqrt(found.part[worst])) / (seen[worst] ** 0.5 if alike else seen[worst])
-    amount = part * float(np.sqrt(np.mean(np.sum((law.vector[:, worst] * noise[worst]) ** 2, axis=1))))
+    amount = part * float(np.sqrt(np.mean(_square(law.vectors[:, :, worst] * noise[worst]))))
     whose = "all sensors" if alike else x.sensors[worst] if sensors > 2 else " or ".join(x.sensors)
     follows = law.words.format(f"{law.size * part:.3g} {law.unit}")
     return [f"what is left of {whose} goes with {follows}: {amount:.3g} nT rms{' of each' * alike}"]
@@ -88,29 +92,64 @@ def _along(left: Array, law: _Law) -> _Found:
 
     Judged are directions, nothing being louder than usual, by contiguous blocks; the amount is that of the whole.
     """
-    each = [_along_one(left[:, s], law.vector[:, s], law.weights) for s in range(left.shape[1])]
+    each = [_along_one(left[:, s], law.vectors[:, :, s], law.weights) for s in range(left.shape[1])]
     t, share, part = np.transpose(each)
     return _Found(t, share, np.maximum(part, 0.0))
 
 
-def _along_one(left: Array, vector: Array, weights: Array) -> tuple[float, float, float]:
-    """The same of one sensor (N, 3): t, the share of its power, and the mean square as a part of the vector."""
-    own, by = (_products(_soft(v)) for v in (left, vector))
+def _along_one(left: Array, vectors: Array, weights: Array) -> tuple[float, float, float]:
+    """The same of one sensor (N, 3), of vectors (K, N, 3): t, the share of its power, and the mean square as a part of
+    them."""
+    own, by = (_products(_soft(v)) for v in (left[None], vectors))
     each = np.array([part.sum() for part in np.array_split((own * by) @ weights, BLOCKS)])
     t = each.mean() / max(float(each.std(ddof=1)) / np.sqrt(BLOCKS), 1e-300)
-    own, by = _products(left), _products(vector)
+    own, by = _products(left[None]), _products(vectors)
     part = float(np.sum((own * by) @ weights) / max(float(np.sum(by**2 @ weights)), 1e-300))
-    return float(t), part * float(np.mean(vector**2) / max(float(np.mean(left**2)), 1e-300)), part
+    return float(t), part * float(np.mean(_square(vectors)) / max(float(np.mean(_square(left[None]))), 1e-300)), part
 
 
-def _soft(vectors: Array) -> Array:
-    """(N, 3), none longer than one: half as long as that where they are of their usual size."""
-    square = np.sum(vectors**2, axis=1, keepdims=True)
-    out: Array = vectors / np.sqrt(np.maximum(square + np.median(square), 1e-300))
+def _turned(left: Array, reads: Array, noise: Array) -> Array:
+    """(3, N, S, 3) what small turns about three axes of each sensor would add, times how much it turns about each: in
+    every other block as what is left (N, S, 3) in the rest says.
+
+    Parameters
+    ----------
+    reads: (N, S, 3), over the noise (S, 3).
+    """
+    out = np.zeros((3, *left.shape))
+    block = np.arange(len(left)) * BLOCKS // len(left)
+    for s in range(left.shape[1]):
+        about = np.cross(np.eye(3)[:, None], reads[:, s] * noise[s]) / noise[s]  # (3, N, 3)
+        alone = [_products(each[None]) for each in about]
+        made = [alone[k] if k == m else _products((about[k] + about[m])[None]) - alone[k] - alone[m] for k, m in _PAIRS]
+        own = _products(_soft(left[None, :, s]))
+        for side in (0, 1):
+            told, asked = block % 2 == side, block % 2 != side
+            shape = np.column_stack([(m[told] - m[told].mean(axis=0)).ravel() for m in made])
+            found = np.linalg.lstsq(shape, (own[told] - own[told].mean(axis=0)).ravel(), rcond=None)[0]
+            spread = np.zeros((3, 3))
+            for (k, m), value in zip(_PAIRS, found, strict=True):
+                spread[k, m] = spread[m, k] = value
+            strength, axes = np.linalg.eigh(spread)
+            strength = np.maximum(strength, 0.0) / max(float(np.maximum(strength, 0.0).sum()), 1e-300)
+            out[:, asked, s] = np.einsum("k,ak,anj->knj", np.sqrt(strength), axes, about[:, asked])
     return out
 
 
+def _soft(vectors: Array) -> Array:
+    """(K, N, 3), at no time longer than one: half as long as that where they are of their usual size."""
+    square = _square(vectors)
+    out: Array = vectors / np.sqrt(np.maximum(square + np.median(square), 1e-300))[:, None]
+    return out
+
+
+def _square(vectors: Array) -> Array:
+    """(N,) sum of squares of vectors (K, N, 3)."""
+    return np.asarray(np.sum(vectors**2, axis=(0, 2)))
+
+
 def _products(vectors: Array) -> Array:
-    """(N, 6) the squares of the axes (N, 3), and the products of each with the next, less their means."""
-    out = np.hstack([vectors**2, vectors * np.roll(vectors, -1, axis=1)])
+    """(N, 6) the squares of the axes of vectors (K, N, 3), and the products of each with the next, summed, less their
+    means."""
+    out = np.hstack([np.sum(vectors**2, axis=0), np.sum(vectors * np.roll(vectors, -1, axis=2), axis=0)])
     return np.asarray(out - out.mean(axis=0))

@@ -19,6 +19,7 @@ from magtensor.loop.evidence.residual import Residual, taken_off
 from magtensor.loop.evidence.spectrum import line_of_the_station, spectral_lines
 from magtensor.loop.fitting.model import Record, State
 from magtensor.loop.fitting.refit import disturbed
+from magtensor.loop.remainder.along_an_effect import along_an_effect_words
 from magtensor.loop.remainder.changing_matrix import changing_matrices
 from magtensor.loop.remainder.excess import excess_rms
 from magtensor.loop.remainder.flagged import (
@@ -75,8 +76,9 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
     outlying = Outlying.of(state, record)
     too_often, theirs = outlying_words(outlying, ~np.asarray(state.fit.keep))
     shows = _what_shows(found, record, excess, sparse)
-    jumps = [] if shows or _of_second_order(state) else popcorn_words(state)
-    words = [*shows, *jumps, *suspects.words, *too_often]
+    if not shows and not _of_second_order(state):
+        shows = along_an_effect_words(state) or popcorn_words(state)
+    words = [*shows, *suspects.words, *too_often]
     band = None if words else limited_band(state.residual)
     times = _slow(state, record) / state.residual.scale
     if not words and (times if band is None else band.slow) > NO_NOISE:
