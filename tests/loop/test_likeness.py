@@ -71,6 +71,11 @@ def test_the_product_of_two_channels_is_named_as_that() -> None:
     assert followed_by_a_product(record.time, product, record) == "heater times core"
     alone = 2.0 * heater + temperature / temperature.std() + 0.2 * rng.standard_normal(SAMPLES)
     assert followed_by_a_product(record.time, alone, record) == ""  # the sum of both
+    powers = np.column_stack([np.ones(SAMPLES), heater, temperature, temperature**2])
+    left = product - powers @ np.linalg.lstsq(powers, product, rcond=None)[0]  # by the laws of both, once adopted
+    assert followed_by_a_product(record.time, left, record) == "heater times core"
+    bent = (temperature / temperature.std()) ** 2 + heater + 0.2 * rng.standard_normal(SAMPLES)
+    assert followed_by_a_product(record.time, bent, record) == ""  # a law of one of them
 
 
 @pytest.mark.parametrize("lag", [0, 7])

@@ -244,7 +244,7 @@ def test_the_share_of_a_source_is_what_it_explains(size: float, of_the_field: fl
     off_the_plane = float(np.sum((VECTORS - VECTORS.mean(axis=0)) ** 2))
     power = size**2 * float(np.var(WAVE)) * off_the_plane
     assert found.share == pytest.approx(power / (power + 9.0), rel=0.1, abs=0.02)
-    assert f"{found.share:.0%} of the variance of what differs between them" in shared_words(found, record.sensors)
+    assert f"{found.share:.0%} of the variance of what differs between them" in shared_words(found, record)
 
 
 def slow(rng: np.random.Generator, shape: tuple[int, ...]) -> Array:

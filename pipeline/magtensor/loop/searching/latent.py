@@ -9,7 +9,6 @@ stretches. Two sensors have one contrast: which of them was disturbed cannot be 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -49,6 +48,7 @@ from magtensor.loop.searching.likeness import (
     effect_along,
     followed,
     followed_by_a_curve,
+    followed_by_a_product,
     held_out_losses,
     of_an_unseen_path,
     with_the_turn_before,
@@ -400,10 +400,10 @@ def _turning(record: Record, state: State) -> bool:
     )
 
 
-def shared_words(found: Sought, sensors: Sequence[str]) -> str:
+def shared_words(found: Sought, record: Record) -> str:
     """A waveform that the sensors share, in words."""
     strength = np.sqrt(np.sum(found.direction**2, axis=1))
-    each = ", ".join(f"{s} {a:.2g} nT" for s, a in zip(sensors, strength, strict=True))
+    each = ", ".join(f"{s} {a:.2g} nT" for s, a in zip(record.sensors, strength, strict=True))
     course = "switches between two levels" if found.switches else f"has periods from {found.period_s:.2g} s on"
     part = f"{found.share:.0%}" if found.share >= 0.01 else "less than 1%"
     words = (
@@ -415,6 +415,7 @@ def shared_words(found: Sought, sensors: Sequence[str]) -> str:
         if independent(found.values) < FEW:
             words += ", as one of several channels, powers and lags is of anything that swings so seldom"
     else:
-        words += " and follows no logged channel"
+        product = followed_by_a_product(found.time, found.values, record)
+        words += f" and goes as {product}, for which there is no model" if product else " and follows no logged channel"
     said = found.like is not None and found.objection.startswith(OF_A_CHANNEL)
     return words + (f"; not adopted: {found.objection}" if found.objection and not said else "")

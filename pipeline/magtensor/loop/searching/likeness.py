@@ -167,7 +167,7 @@ def followed_in_part(time: Array, values: Array, record: Record) -> str:
 
 def followed_by_a_product(time: Array, values: Array, record: Record) -> str:
     """The two channels with one value whose product predicts most of a waveform in stretches that it was not fitted to,
-    and far more than the two do without it, in words; "" where there are none."""
+    and far more than the first two powers of each do without it, in words; "" where there are none."""
     if independent(values) <= FEW:
         return ""
     edges = np.linspace(0, len(values), FOLDS + 1).round().astype(int)
@@ -175,7 +175,7 @@ def followed_by_a_product(time: Array, values: Array, record: Record) -> str:
     least, words = (1.0 - MOST_OF_IT) * float(held_out_losses(values, ones[:, None], edges).sum()), ""
     courses = [(n, np.interp(time, record.time, c)) for n, c in record.logged.items() if c.ndim == 1]
     for (one, a), (other, b) in itertools.combinations(courses, 2):
-        both = np.column_stack([ones, a, b])
+        both = np.column_stack([ones, a, b, a**2, b**2])  # whose laws may be in the model already
         left = float(held_out_losses(values, np.column_stack([both, a * b]), edges).sum())
         if left < least and left < MUCH_LESS * float(held_out_losses(values, both, edges).sum()):
             least, words = left, f"{one} times {other}"

@@ -127,7 +127,7 @@ def _what_shows(found: Search, record: Record, excess: float, sparse: SparseRead
     shared = found.shared
     # noise that grows louder makes a small one by chance, which predicts nothing
     if shared is not None and shared.significant and (shared.gain.consistent or shared.share > OF_A_LINE):
-        words.append(shared_words(shared, record.sensors))
+        words.append(shared_words(shared, record))
     line = strongest_line(state, record, between=sparse is not None)
     # where the platform turns steadily, what is no tone has a small line too
     if line is not None and line[1] ** 2 >= OF_A_LINE * excess**2:
@@ -187,7 +187,7 @@ def _left_by_a_law(found: Search, record: Record) -> list[str]:
     if shared is None or shared.objection != LEFT_BY_LAWS:
         return []
     small = np.all(np.sum(shared.direction**2, axis=1) < np.sum(noise.reshape(-1, 3) ** 2, axis=1))
-    return [shared_words(shared, record.sensors), *attitude_words(found.told)] if small else []
+    return [shared_words(shared, record), *attitude_words(found.told)] if small else []
 
 
 def _largest_of_the_total_field(state: State) -> tuple[str, float]:
