@@ -16,6 +16,7 @@ from magtensor.loop.fitting.log_noise import brought_in
 from magtensor.loop.fitting.model import Adopted, Fitting, Record
 from magtensor.loop.fitting.refit import joint_state
 from magtensor.loop.fitting.trial import trial
+from magtensor.loop.searching import on_fewer_sensors
 from magtensor.loop.searching.any_law import by_any_law, by_any_law_of
 from magtensor.loop.searching.found import Search
 from magtensor.loop.searching.gates import ALPHA
@@ -313,3 +314,18 @@ def test_a_step_beside_a_drift_is_no_curve_of_what_went_on_meanwhile(seed: int) 
     part = np.linspace(-1.0, 1.0, SAMPLES)
     names = [name for name, _ in told_of(found(climbing(seed, 3.0 * part + 2.0 * (part > 0.21)), *ASCENT))]
     assert sorted(names) == ["offset_drift", "offset_step"]
+
+
+def test_of_two_sensors_that_feel_it_one_may_hardly_show_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As of a law that begins at the end only: without the second the others cannot go, with it they can."""
+    values = course(95)
+    record = logged(95, values, np.zeros(SAMPLES))
+    outputs = record.raw.copy()
+    for sensor, size in ((0, 2.0), (2, 0.6)):
+        outputs[:, sensor] += np.multiply.outer(size * values, [1.0, -0.8, 0.6])
+    record = replace(record, raw=outputs)
+    state = joint_state(record, [Adopted(component("channel_response"), as_found(times_field=False))], Fitting())
+    p_values = {"S1": 1e-9, "S2": 0.5, "S3": 0.02, "S4": 0.7}
+    monkeypatch.setattr(on_fewer_sensors, "_significance", lambda *_: p_values)
+    few = on_fewer_sensors.on_those_needed(record, state, 0, Fitting())
+    assert few.adopted[0].sensors == ("S1", "S3") and on_fewer_sensors.named(state, 0) == ("S1", "S3")

@@ -115,9 +115,17 @@ def named(state: State, which: int) -> tuple[str, ...]:
 
 
 def _shown_alone(state: State, which: int) -> tuple[str, ...] | None:
-    """Sensors whose own coefficients are significant, where all others can go together; None where all are needed."""
+    """Sensors whose own coefficients are significant, and as many of the next as it takes that all others can go
+    together: of a law that hardly begins no block tells much. None where all are needed."""
     sensors = sensors_showing(state, which)
-    return sensors if sensors is not None and _spare(state, which, sensors) else None
+    if sensors is None:
+        return None
+    p_values = _significance(state, which)
+    for following in sorted(set(p_values) - set(sensors), key=lambda s: p_values[s]):
+        if _spare(state, which, sensors):
+            return sensors
+        sensors = tuple(s for s in p_values if s in (*sensors, following))
+    return None
 
 
 def _owners(state: State, which: int) -> tuple[str, ...]:
@@ -190,17 +198,20 @@ def _kept(state: State, which: int, sensors: tuple[str, ...]) -> list[int]:
 
 def sensors_showing(state: State, which: int) -> tuple[str, ...] | None:
     """Sensors whose own coefficients are significant; None where all are, or the model is not of single sensors."""
+    p_values = _significance(state, which)
+    showing = tuple(s for s, p in p_values.items() if p < KEEP_ALPHA / len(p_values))
+    return showing if showing and len(showing) < len(p_values) else None
+
+
+def _significance(state: State, which: int) -> dict[str, float]:
+    """The p value of a model's coefficients for each of its sensors, in their order; {} of a model of one."""
     part = slices(state)[which]
     assert state.terms is not None
     owners = state.terms.sensors[part]
-    names = [s for s in state.excitation.sensors if s in owners]
-    if len(names) < 2:
-        return None
-    own = {s: [part.start + i for i, o in enumerate(owners) if o == s] for s in names}
+    own = {s: [part.start + i for i, o in enumerate(owners) if o == s] for s in state.excitation.sensors if s in owners}
+    if len(own) < 2:
+        return {}
     if happens_once(state.adopted[which]):
-        p_values = [significance_at_once(state, own[s]) for s in names]
-    else:
-        tests = families(state)
-        p_values = [tests.p_value(own[s]) for s in names]
-    showing = [s for s, p in zip(names, p_values, strict=True) if p < KEEP_ALPHA / len(names)]
-    return tuple(showing) if showing and len(showing) < len(names) else None
+        return {s: significance_at_once(state, theirs) for s, theirs in own.items()}
+    tests = families(state)
+    return {s: tests.p_value(theirs) for s, theirs in own.items()}

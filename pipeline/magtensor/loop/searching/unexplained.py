@@ -169,7 +169,7 @@ def _what_shows(found: Search, record: Record, excess: float, sparse: SparseRead
                 cause = ": the field, of which only a constant is known, or one of the platform"
             if names := channels_of_the_total_field(state, ALPHA):
                 cause += f"; it follows {' and '.join(names)}"
-        words.append(f"{slow:.3g} nT rms of |b| - F, {where}, is no white noise{cause}")
+        words.append(f"{slow:.3g} nT rms of |b| - F, {where}, is more than their white noise makes{cause}")
     return words
 
 
@@ -226,7 +226,7 @@ def noise_words(state: State, record: Record, band: Band | None) -> list[str]:
         station = of_the_station(state, record)
         makes = "may make all" if station > slow else f"makes {station:.2g} nT"  # known from how its readings scatter
         theirs = f": the base station's own noise {makes} of it" if TWICE * station > slow else ""
-        words.append(f"{slow:.3g} nT rms of |b| - F is not white{theirs}")
+        words.append(f"{slow:.3g} nT rms of |b| - F is more than the white noise of the sensors makes{theirs}")
     return words
 
 
