@@ -16,7 +16,8 @@ from magtensor.loop.evidence.gains import Gain
 from magtensor.loop.evidence.grams import Whitened
 from magtensor.loop.fitting.model import Adopted, Fitting
 from magtensor.loop.fitting.refit import joint_state
-from magtensor.loop.searching.gates import ALPHA, SECOND_ORDER, Candidate, explained_before, seen_between
+from magtensor.loop.fitting.separation import SECOND_ORDER
+from magtensor.loop.searching.gates import ALPHA, Candidate, explained_before, seen_between
 from magtensor.loop.searching.outcome import why
 from magtensor.loop.searching.rounds import with_lines
 from magtensor.loop.searching.screening import candidates_of

@@ -16,9 +16,10 @@ from magtensor.loop.evidence.grams import grams
 from magtensor.loop.fitting.errors_before_after import folds_for
 from magtensor.loop.fitting.model import Adopted, Fitting, Record
 from magtensor.loop.fitting.refit import joint_state
+from magtensor.loop.fitting.separation import SECOND_ORDER
 from magtensor.loop.fitting.trial import on_the_folds_of, trial
 from magtensor.loop.searching.contribution import eliminate, removal
-from magtensor.loop.searching.gates import ALPHA, SECOND_ORDER, Candidate
+from magtensor.loop.searching.gates import ALPHA, Candidate
 from magtensor.loop.searching.outcome import why
 from magtensor.loop.searching.rivals import part_of_a_drift
 from magtensor.loop.searching.screening import candidates_of

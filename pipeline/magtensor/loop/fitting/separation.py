@@ -15,6 +15,7 @@ from magtensor.loop.evidence.gains import Gain, held_out_gain
 from magtensor.loop.evidence.grams import grams
 from magtensor.loop.fitting.model import Adopted, State
 
+SECOND_ORDER = 1e-5  # of the sum of squares that is explained: 0.3 % of an effect's size
 SEPARATION = 9.0  # twice the log likelihood ratio between two models below which the data do not tell them apart
 
 

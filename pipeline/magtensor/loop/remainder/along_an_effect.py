@@ -11,12 +11,12 @@ import numpy as np
 
 from magtensor.calibration.types import Array
 from magtensor.loop.fitting.model import State
+from magtensor.loop.fitting.separation import SECOND_ORDER
 
 MEANS = 8  # samples taken together: noise of a log, which is white, is not in how these follow each other
 BLOCKS = 20
 ALPHA = 0.001  # for all effects and sensors together
 ONE_VECTOR = 0.95  # of the square of what an effect adds to a sensor, and of what goes slowly there
-SECOND_ORDER = 1e-5  # of that square, which the next order of any law may be
 
 
 def along_an_effect_words(state: State) -> list[str]:

@@ -17,10 +17,10 @@ from magtensor.loop.evidence.lone_event import MOST_LEFT
 from magtensor.loop.evidence.residual import Residual, taken_off
 from magtensor.loop.evidence.statistics import by_long_blocks
 from magtensor.loop.fitting.model import Adopted, State, of_time, turning
+from magtensor.loop.fitting.separation import SECOND_ORDER
 from magtensor.loop.searching.contribution import a_tone, happens_once
 
 ALPHA = 0.005  # family-wise probability that a clean survey gets an adoption, before the second gate
-SECOND_ORDER = 1e-5  # of the sum of squares that is explained: 0.3 % of an effect's size
 OF_THE_LAW = 0.0025  # the same, that the law of an effect may miss: 5 % of its size
 LEAST_REDUCTION = 1e-4  # of the held-out sum of squares: smaller is significant only in very long surveys
 FAR_MORE = 5.0  # times what is explained: two effects of one trend, which help each other, come to twice it

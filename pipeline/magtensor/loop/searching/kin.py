@@ -20,8 +20,9 @@ from magtensor.error_models.needs import FACTS
 from magtensor.error_models.terms import Terms
 from magtensor.loop.evidence.assessment import NEARLY_ALL, Assessment
 from magtensor.loop.fitting.model import Adopted, State, generic, of_time, turning
+from magtensor.loop.fitting.separation import SECOND_ORDER
 from magtensor.loop.searching.contribution import a_tone, happens_once, moments
-from magtensor.loop.searching.gates import SECOND_ORDER, Candidate, explained_by, seen_between
+from magtensor.loop.searching.gates import Candidate, explained_by, seen_between
 
 MOST = 0.5  # of what a candidate explains
 POWERS = 6  # of time and of a channel: more than any law of an effect that has a name

@@ -10,7 +10,7 @@ from magtensor.error_models.waveform import NAME
 from magtensor.loop.evidence.assessment import estimated, explained
 from magtensor.loop.fitting.model import Adopted, Fitting, Record, State, turning
 from magtensor.loop.fitting.refit import joint_state
-from magtensor.loop.fitting.separation import SEPARATION, fold_gain
+from magtensor.loop.fitting.separation import SECOND_ORDER, SEPARATION, fold_gain
 from magtensor.loop.searching.contribution import (
     KEEP_ALPHA,
     families,
@@ -20,7 +20,6 @@ from magtensor.loop.searching.contribution import (
     significance_at_once,
     slices,
 )
-from magtensor.loop.searching.gates import SECOND_ORDER
 from magtensor.loop.searching.overheard import shown_by_one
 
 MOST = 0.5  # of a model's sensors

@@ -10,11 +10,11 @@ from magtensor.error_models.settings import AnyChannel, Duration, EventTimes, Ra
 from magtensor.error_models.terms import joined
 from magtensor.loop.evidence.assessment import estimated, explained
 from magtensor.loop.fitting.model import Adopted, State, generic
-from magtensor.loop.fitting.separation import SEPARATION, fold_gain, separated
+from magtensor.loop.fitting.separation import SECOND_ORDER, SEPARATION, fold_gain, separated
 from magtensor.loop.searching.beginnings import beginning
 from magtensor.loop.searching.by_its_name import by_its_name
 from magtensor.loop.searching.contribution import happens_once
-from magtensor.loop.searching.gates import OF_THE_LAW, SECOND_ORDER, Candidate
+from magtensor.loop.searching.gates import OF_THE_LAW, Candidate
 from magtensor.loop.searching.several_logs import worse_log
 
 SMALL_PART = 0.5  # less than half is no rival: something else is the cause of most of it

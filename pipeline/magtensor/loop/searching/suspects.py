@@ -14,12 +14,13 @@ from magtensor.loop.evidence.grams import Whitened
 from magtensor.loop.evidence.own_noise import OwnNoise
 from magtensor.loop.evidence.residual import taken_off
 from magtensor.loop.fitting.model import State
+from magtensor.loop.fitting.separation import SECOND_ORDER
 from magtensor.loop.remainder.sparse_readings import SparseReadings
 from magtensor.loop.searching.beside_a_hole import OF_A_HOLE
 from magtensor.loop.searching.between_readings import BETWEEN
 from magtensor.loop.searching.contribution import happens_once, moments
 from magtensor.loop.searching.found import Search
-from magtensor.loop.searching.gates import SECOND_ORDER, Candidate
+from magtensor.loop.searching.gates import Candidate
 from magtensor.loop.searching.keeping import NOT_AS_ASSUMED
 
 ALPHA = 0.001  # of noise that explains a model, whatever the model predicts

@@ -19,6 +19,7 @@ from magtensor.loop.evidence.residual import Residual, taken_off
 from magtensor.loop.evidence.spectrum import line_of_the_station, spectral_lines
 from magtensor.loop.fitting.model import Record, State
 from magtensor.loop.fitting.refit import disturbed
+from magtensor.loop.fitting.separation import SECOND_ORDER
 from magtensor.loop.remainder.along_an_effect import along_an_effect_words
 from magtensor.loop.remainder.changing_matrix import changing_matrices
 from magtensor.loop.remainder.excess import excess_rms
@@ -43,7 +44,7 @@ from magtensor.loop.remainder.tones import channels_of_the_line, of_the_turning
 from magtensor.loop.remainder.turned_too_far import turned_too_far_words
 from magtensor.loop.remainder.with_the_field import with_the_field
 from magtensor.loop.searching.found import Search
-from magtensor.loop.searching.gates import SECOND_ORDER, explained_by
+from magtensor.loop.searching.gates import explained_by
 from magtensor.loop.searching.latent import LEFT_BY_LAWS, shared_words
 from magtensor.loop.searching.like_a_station import (
     channels_of_the_total_field,
