@@ -13,9 +13,11 @@ from loop_cases import BASE, adopted_names, lasting_effects, linear_state, looke
 
 from magtensor.error_models.terms import Terms
 from magtensor.loop.fitting.model import Adopted, Fitting, Record, State
+from magtensor.loop.fitting.refit import joint_state
+from magtensor.loop.fitting.separation import SECOND_ORDER
 from magtensor.loop.searching import by_hand, outcome, rivals, rounds
 from magtensor.loop.searching.course_of_time import BesideTime
-from magtensor.loop.searching.gates import ALPHA, Candidate
+from magtensor.loop.searching.gates import ALPHA, Candidate, explained_by
 from magtensor.loop.searching.keeping import ONE_OF_A_KIND, Fitted
 from magtensor.registry import Registry
 
@@ -305,3 +307,17 @@ def test_a_mount_that_slipped_is_no_part_of_what_a_current_bends(seed: int) -> N
     bent = looked_at(state, Adopted(registry.find("error_model", "channel_alignment"), bends))
     assert slipped.assessment.gain.total > 100.0 * bent.assessment.gain.total
     assert rivals.part_of_a_drift(slipped, [slipped, bent], state) is None
+
+
+def test_what_was_dropped_for_its_next_order_is_a_rival() -> None:
+    """A jump in the place of one with fewer coefficients: the law of a large one may miss as much as it adds."""
+    added = np.zeros((1200, 4, 3))
+    added[700:, 1] = [300.0, -200.0, 100.0]
+    model = Adopted(Registry.load().find("error_model", "offset_step"), {"time_s": 699.5})
+    state = joint_state(synthetic(9, added=added), [model], Fitting())
+    whole = explained_by(state, [0])
+    assert whole > 1e6
+    for share, alike in ((0.9, {"offset_step"}), (1.1, set())):
+        gain = SimpleNamespace(total=share * SECOND_ORDER * whole)
+        chosen: Any = SimpleNamespace(assessment=SimpleNamespace(gain=gain), before=None)
+        assert rivals.hardly_less(chosen, ("offset_step", "scale_step"), state) == alike

@@ -14,7 +14,7 @@ from magtensor.loop.fitting.separation import SECOND_ORDER, SEPARATION, fold_gai
 from magtensor.loop.searching.beginnings import beginning
 from magtensor.loop.searching.by_its_name import by_its_name
 from magtensor.loop.searching.contribution import happens_once
-from magtensor.loop.searching.gates import OF_THE_LAW, Candidate
+from magtensor.loop.searching.gates import OF_THE_LAW, Candidate, explained_by
 from magtensor.loop.searching.several_logs import worse_log
 
 SMALL_PART = 0.5  # less than half is no rival: something else is the cause of most of it
@@ -76,6 +76,15 @@ def by_a_worse_log(chosen: Candidate, others: Sequence[Candidate], state: State)
         return reference.over(fold_gain(other.before or state, colours, other.terms, parts=parts)).total
 
     return {c.model.name for c in others if worse_log(chosen, c, behind(c), state)}
+
+
+def hardly_less(chosen: Candidate, dropped: Sequence[str], state: State) -> set[str]:
+    """Names of the adopted models in whose place a candidate was kept for no more than the next order of what each of
+    them explains: the law of any of these may miss as much."""
+    gain, seen = chosen.assessment.gain.total, chosen.before or state
+    names = [a.name for a in seen.adopted]
+    gone = {names.index(name): name for name in dropped if name in names}
+    return {name for place, name in gone.items() if gain <= SECOND_ORDER * explained_by(seen, [place])}
 
 
 def containing(best: Candidate, possible: Sequence[Candidate], state: State) -> Candidate:

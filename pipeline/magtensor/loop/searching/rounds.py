@@ -52,6 +52,7 @@ from magtensor.loop.searching.rivals import (
     by_a_worse_log,
     containing,
     events_like,
+    hardly_less,
     hindered_by_another,
     overlaps,
     part_of,
@@ -296,7 +297,8 @@ class Rounds:
                     elif tried.why == MAYBE_HEAT and stands_for_less(c, chosen, before.state):
                         refuse(c.model.name, f"{chosen.model.name} explains the same and more, and failed")
                 continue
-            rivals = tuple(sorted({*rivals, *stations_like(tried.after.state, self.models)}))
+            alike = stations_like(tried.after.state, self.models) | hardly_less(chosen, dropped, before.state)
+            rivals = tuple(sorted({*rivals, *alike}))
             return Kept(tried.after, chosen, rivals, channels, dropped, refused)
         return Kept(None, refused=refused)
 
