@@ -7,7 +7,8 @@ quadratic nonlinearity. So an adopted effect that follows the attitude and expla
 taken out again. So is a tone that may be a harmonic of how the platform turns; and so is what happened once, where more
 of the kind beside it is significant and predicts nothing, as where a sensor wanders, or where the sensors share a
 waveform that has no name and is larger, or switches along the same vectors: a step or a passage may be a part of it,
-or where nearly all that is left out of the calibration lies along its vector; so are tones close to each other along
+or where nearly all that is left out of the calibration lies along its vector; so is a jump or a drift of a scale factor
+beside which the gain goes on to wander; so are tones close to each other along
 one vector, the sidebands of one whose strength or frequency changes; so is an error of the base station that is less
 than what stays of |b| - F;
 and a source that nobody logged, whose waveform may be a small part of any law that has no name. And whatever is larger,
@@ -45,6 +46,7 @@ from magtensor.loop.searching.contribution import happens_once, moments, slices
 from magtensor.loop.searching.found import Search, without_and_with
 from magtensor.loop.searching.suspects import unlikely
 from magtensor.loop.searching.unexplained import restless, unexplained
+from magtensor.loop.searching.wandering_gain import of_a_wandering_gain
 
 WORSE = 1.01  # times the held-out rms without an effect, all noise alike: noise of a colour does not make up for that
 NAMELESS = 2.0  # times what stays, that a response to a logged vector explains if it is the law
@@ -74,6 +76,7 @@ def overshadowed(found: Search, fixed: int) -> tuple[list[int], str] | None:
         or _of_one_tone(state, fixed)
     )
     part = part or of_a_restless_station(found, fixed) or of_what_jumps(state, fixed)
+    part = part or of_a_wandering_gain(state, fixed)
     if part is not None:
         return part
     for places in _of_one_name(state, fixed):
