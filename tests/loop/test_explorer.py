@@ -312,7 +312,7 @@ def test_a_session_that_is_piped_in(
     # taken up again, in the same file
     status, said = converse(monkeypatch, capsys, session, "status", "save", "quit", "never reached")
     assert status == 0 and "never reached" not in said
-    assert "1. adopt current_field channel=current_heater: passes" in said
+    assert "1. adopt current_field channel=current_heater: significant, and predicts" in said
     assert "Adopted by hand: current_field" in said and "not saved" not in said
     verdict = json.loads((tmp_path / "few.session-1.explored" / "verdict.json").read_text())
     assert [a["by"] for a in verdict["adopted"]] == ["person"]
