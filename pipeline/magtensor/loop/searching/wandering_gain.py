@@ -16,21 +16,25 @@ from magtensor.loop.searching.course_of_time import is_a_course
 MEANS = 8  # samples taken together
 BLOCKS = 20
 ALPHA = 0.001  # of one sensor
+A_GAIN = 0.7  # of what an effect adds to a sensor, along what it reads: of the gain of one axis three quarters
+AN_OFFSET = 0.95  # the same of what adds to the axes too, of which an offset is across the field at other attitudes
 MUCH_OF_IT = 0.3  # of what an effect adds to a sensor, that its gain wanders by beside it
 
 
 def of_a_wandering_gain(state: State, fixed: int) -> tuple[list[int], str] | None:
-    """The place of the adopted course of time or event that turns with what its sensors read, and beside which the gain
+    """The place of the adopted course of time or event that lies along what its sensors read, and beside which the gain
     of the one that has most of it goes on to wander by much of that; of several the smallest, and why. None where there
     is none."""
     x, doubted = state.excitation, []
     if state.residual.across is None or len(state.residual.across) < 2 * BLOCKS * MEANS:
         return None
     for place, model in enumerate(state.adopted[fixed:], start=fixed):
-        if not (happens_once(model) or is_a_course(model, x)) or model.terms(x).adds_to_axes:
+        if not (happens_once(model) or is_a_course(model, x)):
             continue
-        added = _added(state, place)
+        added, along = _added(state, place)
         sensor = int(np.argmax(added))
+        if along[sensor] < (AN_OFFSET if model.terms(x).adds_to_axes else A_GAIN) * added[sensor]:
+            continue
         wanders = _of_its_gain(state, sensor)
         if wanders > MUCH_OF_IT * added[sensor]:
             doubted.append((float(added[sensor]), place, x.sensors[sensor], wanders))
@@ -60,16 +64,20 @@ def _of_its_gain(state: State, sensor: int) -> float:
     return float(np.sqrt(each.mean() * one)) / seen
 
 
-def _added(state: State, place: int) -> Array:
-    """(S,) nT rms that an adopted model adds to each sensor, beside what C and o take."""
+def _added(state: State, place: int) -> tuple[Array, Array]:
+    """(S,) nT rms that an adopted model adds to each sensor, beside what C and o take, and of that along what it
+    reads."""
     x, samples = state.excitation, state.residual.samples
     terms = state.adopted[place].terms(x).at(samples)
     if terms.delay is not None:
-        return np.zeros(len(x.sensors))
+        return np.zeros(len(x.sensors)), np.zeros(len(x.sensors))
     made = terms.contribution(state.theta[place], 3 * len(x.sensors)).reshape(len(samples), -1, 3)
-    out = np.zeros(len(x.sensors))
+    out, along = np.zeros((2, len(x.sensors)))
+    reads = x.sensed(x.field)[samples]
+    reads = reads / np.linalg.norm(reads, axis=2, keepdims=True)
     for sensor in range(len(x.sensors)):
         free = np.column_stack([np.ones(len(samples)), x.output[samples, sensor]])
         left = made[:, sensor] - free @ np.linalg.lstsq(free, made[:, sensor], rcond=None)[0]
         out[sensor] = np.sqrt(np.mean(np.sum(left**2, axis=1)))
-    return out
+        along[sensor] = np.sqrt(np.mean(np.sum(left * reads[:, sensor], axis=1) ** 2))
+    return out, along
