@@ -72,3 +72,16 @@ def test_by_how_much_it_wanders_beside_a_step() -> None:
     state = with_a_step(step + 2.0 * slow)
     alone: Any = SimpleNamespace(residual=SimpleNamespace(across=None), excitation=state.excitation, adopted=())
     assert of_a_wandering_gain(alone, 0) is None
+
+
+def test_a_slip_of_the_samples_is_no_gain() -> None:
+    """What it adds is no series of its own, to first order: it is not asked."""
+    record = synthetic(6, SAMPLES, turning_s=8.0)
+    raw = record.raw.copy()
+    raw[701:, 0] = record.raw[700:-1, 0]
+    raw[:, 0] *= 1.0 + 4e-5 * np.sin(np.arange(SAMPLES) / 40.0)[:, None]
+    model = Registry.load().find("error_model", "lag_step")
+    slip = Adopted(model, {"time_s": 700.5, "span_s": SAMPLES - 1.0}, ("S1",))
+    state = joint_state(replace(record, raw=raw), [slip], Fitting())
+    assert state.theta[0][0] == pytest.approx(1.0, abs=0.05)
+    assert of_a_wandering_gain(state, 0) is None

@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from magtensor.calibration.types import Array
+from magtensor.error_models.terms import Terms
 from magtensor.loop.fitting.model import State
 from magtensor.loop.searching.contribution import happens_once
 from magtensor.loop.searching.course_of_time import is_a_course
@@ -29,11 +30,12 @@ def of_a_wandering_gain(state: State, fixed: int) -> tuple[list[int], str] | Non
     if state.residual.across is None or len(state.residual.across) < 2 * BLOCKS * MEANS:
         return None
     for place, model in enumerate(state.adopted[fixed:], start=fixed):
-        if not (happens_once(model) or is_a_course(model, x)):
+        terms = model.terms(x).at(state.residual.samples)
+        if not (happens_once(model) or is_a_course(model, x)) or terms.delay is not None:
             continue
-        added, along = _added(state, place)
+        added, along = _added(state, terms, state.theta[place])
         sensor = int(np.argmax(added))
-        if along[sensor] < (AN_OFFSET if model.terms(x).adds_to_axes else A_GAIN) * added[sensor]:
+        if along[sensor] < (AN_OFFSET if terms.adds_to_axes else A_GAIN) * added[sensor] or not added[sensor]:
             continue
         wanders = _of_its_gain(state, sensor)
         if wanders > MUCH_OF_IT * added[sensor]:
@@ -64,14 +66,11 @@ def _of_its_gain(state: State, sensor: int) -> float:
     return float(np.sqrt(each.mean() * one)) / seen
 
 
-def _added(state: State, place: int) -> tuple[Array, Array]:
-    """(S,) nT rms that an adopted model adds to each sensor, beside what C and o take, and of that along what it
-    reads."""
+def _added(state: State, terms: Terms, theta: Array) -> tuple[Array, Array]:
+    """(S,) nT rms that terms of an adopted model add to each sensor, beside what C and o take, and of that along what
+    it reads."""
     x, samples = state.excitation, state.residual.samples
-    terms = state.adopted[place].terms(x).at(samples)
-    if terms.delay is not None:
-        return np.zeros(len(x.sensors)), np.zeros(len(x.sensors))
-    made = terms.contribution(state.theta[place], 3 * len(x.sensors)).reshape(len(samples), -1, 3)
+    made = terms.contribution(theta, 3 * len(x.sensors)).reshape(len(samples), -1, 3)
     out, along = np.zeros((2, len(x.sensors)))
     reads = x.sensed(x.field)[samples]
     reads = reads / np.linalg.norm(reads, axis=2, keepdims=True)
