@@ -21,7 +21,8 @@ from magtensor.recipe.plan import Plan
 from magtensor.survey.flags import summary
 from magtensor.survey.in_memory import Held
 from magtensor.survey.model import Survey, Variable
-from magtensor.verdict import WORSE, survey_block
+from magtensor.verdict import survey_block
+from magtensor.verdict_words import WORSE
 
 if TYPE_CHECKING:
     from magtensor.calibration.types import Array, ArrayCalibration

@@ -60,6 +60,7 @@ def run(
 ) -> None:
     """Run RECIPE on a survey, or a result.nc again from its own provenance."""
     from magtensor.session import run_recipe
+    from magtensor.verdict_words import lines
 
     directory = output or Path(f"{recipe.stem}.result")
     finished = run_recipe(
@@ -74,7 +75,8 @@ def run(
         click.echo(f"report:  {directory / 'report.html'}")
     else:
         click.echo("report:  not written; it needs matplotlib and jinja2: pip install 'magtensor[report]'")
-    click.echo(finished.sentence)
+    for line in lines(finished.outcome):
+        click.echo(line)
 
 
 @cli.command()

@@ -21,7 +21,8 @@ from magtensor.refusal import picture_named
 from magtensor.session import Computed, Finished, compute, require_verifying
 from magtensor.survey.in_memory import Held, SurveyLike, given_survey
 from magtensor.survey.model import Survey
-from magtensor.verdict import sentence, survey_block
+from magtensor.verdict import survey_block
+from magtensor.verdict_words import lines, sentence
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -191,7 +192,7 @@ class ClosedLoop:
 
 def summary(verdict: dict[str, Any]) -> str:
     """A verdict in a few lines of text."""
-    lines = [sentence(verdict)]
+    told = lines(verdict)
     for one in verdict["adopted"]:
         evidence = one["evidence"]
         settings = ", ".join(f"{k} {_short(v)}" for k, v in one["settings"].items() if not isinstance(v, list))
@@ -209,16 +210,16 @@ def summary(verdict: dict[str, Any]) -> str:
             *([f"not told from {', '.join(rivals)}"] if rivals else []),
             *([_other_channels(one, ", ".join(others))] if others else []),
         ]
-        lines.append(f"  adopted {one['error_model']}: {'; '.join(words)}")
+        told.append(f"  adopted {one['error_model']}: {'; '.join(words)}")
     looked_at = {c["error_model"] for step in verdict.get("steps", []) for c in step["looked_at"]}
     if rejected := [
         r["error_model"] for r in verdict["rejected"] if r["error_model"] in looked_at or r.get("by") == "person"
     ]:
-        lines.append(f"  looked at and not adopted: {', '.join(rejected)}")
+        told.append(f"  looked at and not adopted: {', '.join(rejected)}")
     if verdict["not_tested"]:
         missing = ", ".join(f"{n['error_model']} ({' and '.join(n['missing'])})" for n in verdict["not_tested"])
-        lines.append(f"  not tested for want of channels: {missing}")
-    return "\n".join(lines)
+        told.append(f"  not tested for want of channels: {missing}")
+    return "\n".join(told)
 
 
 def _other_channels(one: dict[str, Any], names: str) -> str:

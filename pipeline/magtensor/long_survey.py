@@ -39,7 +39,8 @@ from magtensor.session import Finished
 from magtensor.survey.flags import Flag, flag_ranges
 from magtensor.survey.model import Survey, without_variables
 from magtensor.survey.source import Source
-from magtensor.verdict import sentence, survey_block, verdict
+from magtensor.verdict import survey_block, verdict
+from magtensor.verdict_words import sentence
 
 if TYPE_CHECKING:
     import xarray as xr

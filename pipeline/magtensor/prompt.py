@@ -17,6 +17,7 @@ from magtensor.errors import MagtensorError, UsageError, did_you_mean
 from magtensor.explorer import Explorer
 from magtensor.recipe.source import load_yaml
 from magtensor.refusal import picture_named
+from magtensor.verdict_words import lines, lines_of_the_rest
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -160,7 +161,8 @@ class Session:
             )  # fmt: skip
         self.console.print(table)
         words = self.explorer.left_over()
-        self._say(("not explained: " if words["present"] else "") + words["description"])
+        for line in lines_of_the_rest(words):
+            self._say(line)
         if words["looks_like"]:
             self._say(f"looks like: {', '.join(words['looks_like'])}")
 
@@ -227,7 +229,8 @@ class Session:
         finished = self.explorer.save(directory)
         self.saved = self.explorer.decisions
         self._say(f"results: {directory / 'result.nc'}")
-        self._say(finished.sentence)
+        for line in lines(finished.outcome):
+            self._say(line)
 
     def help(self) -> None:
         """The commands."""

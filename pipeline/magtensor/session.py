@@ -24,7 +24,8 @@ from magtensor.runner import RunResult, StageRecord, run, told_of_reading
 from magtensor.survey.in_memory import Held
 from magtensor.survey.model import Survey
 from magtensor.survey.source import Source
-from magtensor.verdict import sentence, verdict
+from magtensor.verdict import verdict
+from magtensor.verdict_words import sentence
 
 HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
 

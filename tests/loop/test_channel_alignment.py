@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from loop_cases import BASE, adopted_names, scenario, verdict_of
 
-from magtensor.verdict import sentence
+from magtensor.verdict_words import sentence
 
 TURNS = ["channel_alignment", "temperature_alignment", "alignment_drift", "turn_step", "channel_response", "hysteresis"]
 CHANNELS = BASE["channels"] | {

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from loop_cases import BASE, adopted_names, scenario, verdict_of
 
-from magtensor.verdict import sentence
+from magtensor.verdict_words import sentence
 
 MODELS = ["channel_rate", "channel_response", "current_field", "channel_alignment", "periodic_interference"]
 MODELS += ["latent_source", "offset_drift", "warm_up", "temperature_offset", "temperature_rate", "eddy_current"]

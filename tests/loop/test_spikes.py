@@ -14,7 +14,8 @@ from magtensor.loop.fitting.seen import over_disturbances
 from magtensor.preparing import empty_survey
 from magtensor.recipe.plan import read_plan
 from magtensor.runner import run
-from magtensor.verdict import sentence, verdict
+from magtensor.verdict import verdict
+from magtensor.verdict_words import sentence
 
 SPIKES = 25
 

@@ -18,7 +18,7 @@ from magtensor.loop.remainder.predictable import converter_words
 from magtensor.loop.searching.found import Search, Step
 from magtensor.loop.searching.unexplained import unexplained
 from magtensor.registry import Registry
-from magtensor.verdict import sentence
+from magtensor.verdict_words import sentence
 
 SAMPLES = 3000
 

@@ -134,9 +134,12 @@ def test_page_says_what_the_files_say(whole: Path) -> None:
     text = words(parsed(whole / "report.html"))
     outcome = json.loads((whole / "verdict.json").read_text())
     from magtensor.report.tables import number
-    from magtensor.verdict import sentence
+    from magtensor.verdict_words import told
 
-    assert sentence(outcome) in text
+    said = told(outcome)
+    assert f"{said.head}." in text
+    for heading, items in said.groups.items():
+        assert heading in text and all(item in text for item in items)
     for block in ("total_field_rms_nT", "tensor_rms_nT_per_m", "invariant_rms"):
         for value in outcome["error"]["fit"][block].values():
             assert number(value) in text

@@ -23,7 +23,7 @@ from magtensor.session import compute, run_recipe
 from magtensor.simulate import simulate, write
 from magtensor.survey.canonical import read_canonical
 from magtensor.survey.in_memory import given_survey
-from magtensor.verdict import sentence
+from magtensor.verdict_words import sentence
 
 SCENARIO: dict[str, Any] = {
     "title": "a cross of four sensors, tumbled",

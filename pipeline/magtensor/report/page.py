@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from magtensor.report.content import Content
+    from magtensor.verdict_words import Told
 
 PAGE = "report.html"
 UNTITLED = "Calibration of a magnetometer array"
@@ -80,7 +81,7 @@ def facts(content: Content) -> dict[str, Any]:
         "recipe": recipe,
         "recipe_text": _yaml(recipe),
         "survey_facts": survey_facts(content),
-        "sentence": _sentence(content),
+        "told": _told(content),
         "found": {"adopted": [], "rejected": [], "not_tested": [], **(content.outcome or {})},
         "unexplained": _unexplained(content),
         "errors": tables.errors(content),
@@ -132,12 +133,10 @@ def _unexplained(content: Content) -> Mapping[str, Any] | None:
     return said if said.get("present") else None
 
 
-def _sentence(content: Content) -> str:
-    from magtensor.verdict import sentence
+def _told(content: Content) -> Told:
+    from magtensor.verdict_words import Told, told
 
-    if content.outcome is None:
-        return "There is no verdict.json beside this result."
-    return sentence(dict(content.outcome))
+    return Told("There is no verdict.json beside this result") if content.outcome is None else told(content.outcome)
 
 
 def _yaml(recipe: Mapping[str, Any]) -> str:

@@ -113,11 +113,14 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
         left_out, noise = flagged_words(flagged, state, record, sparse)
         (beside if noise and not paused else words).append(left_out + paused)
     present = bool(words)
+    findings = words if present else noise_words(state, record, band)
     untested = [MODEL] if shaped and MODEL in found.not_tested else []
     return {
         "present": present,
         "excess_rms_nT": excess,
-        "description": "; ".join([*(words if present else noise_words(state, record, band)), *beside]),
+        "description": "; ".join([*findings, *beside]),
+        "findings": findings,
+        "notes": beside,
         "looks_like": untested + suspects.nearest if present else [],
     }
 
