@@ -9,7 +9,7 @@ import pytest
 from loop_cases import Array, linear_state, synthetic
 
 from magtensor.loop.fitting.model import Fitting, Record
-from magtensor.loop.remainder.changing_matrix import changing_matrices
+from magtensor.loop.remainder.changing_matrix import SLOW, changing_matrices
 from magtensor.loop.searching.search import search
 from magtensor.loop.searching.unexplained import NOISE, unexplained
 from magtensor.registry import Registry
@@ -88,6 +88,15 @@ def test_of_a_channel_for_each_sensor_its_own_counts() -> None:
     assert found.sensors == ("S4",) and found.waveform == "temperature"
 
 
+def test_no_name_of_a_channel_is_in_the_way() -> None:
+    """Channels are of any name: one of them hides none of the slow courses of time that nobody logged."""
+    rng = np.random.default_rng(6)
+    logged = {name: rng.standard_normal(1200) for name in ("cosines", "time", "jump", "the field")}
+    disturbed = with_channels(turned(synthetic(3, turning_s=3.0), 2, 4e-5 * creep(1200)), **logged)
+    (found,) = changing_matrices(linear_state(disturbed), ALPHA)
+    assert found.waveform == SLOW and "changes with time" in found.words
+
+
 def test_a_neighbour_that_is_heard_while_a_pump_runs() -> None:
     rng = np.random.default_rng(7)
     on = pump(rng, 1200)
@@ -104,7 +113,7 @@ def test_two_sensors_of_five_each_in_its_own_way() -> None:
     w = warmth(np.random.default_rng(8), 1200)
     disturbed = turned(turned(record, 0, 6e-5 * creep(1200)), 3, 4e-5 * w)
     found = changing_matrices(linear_state(with_channels(disturbed, temperature=w)), ALPHA)
-    assert {(one.sensors, one.waveform) for one in found} == {(("S1",), "cosines"), (("S4",), "temperature")}
+    assert {(one.sensors, one.waveform) for one in found} == {(("S1",), SLOW), (("S4",), "temperature")}
 
 
 def test_of_two_sensors_either_may_have_turned() -> None:

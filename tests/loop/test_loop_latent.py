@@ -15,7 +15,7 @@ from magtensor.error_models.switching import two_levels
 from magtensor.error_models.waveform import course_of, free_directions
 from magtensor.loop.correcting.correction import corrected_raw, hidden_waveform
 from magtensor.loop.evidence.factor import noise_alone, with_factor
-from magtensor.loop.evidence.shared_waveform import ALPHA, strongest
+from magtensor.loop.evidence.shared_waveform import ALPHA, second_factor, strongest
 from magtensor.loop.fitting.model import Adopted, Fitting, Record
 from magtensor.loop.fitting.refit import joint_state
 from magtensor.loop.fitting.wandering import narrowed_to, of_sensors
@@ -73,6 +73,27 @@ def test_a_source_that_comes_and_goes_tells_as_much_as_before() -> None:
     wave = np.repeat(rng.random(50) < 0.3, 60).astype(float) * (np.arange(3000) < 1500)
     z = (own_noise(rng, 3000, 4) + 0.4 * np.outer(wave, rng.standard_normal(12))) @ basis
     assert strongest(z, basis, by_sensor(4)).p < 1e-12
+
+
+@pytest.mark.parametrize("loud_times", [1.0, 4.0])
+def test_one_source_in_noise_that_is_loud_for_a_while_is_one(loud_times: float) -> None:
+    """That noise makes what the sensors share vary as few samples would; a second source is one all the same."""
+    strengths = []
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        basis = plane(rng, 4)
+        loud = np.where(np.arange(3000) < 300, loud_times, 1.0)[:, None]
+        waves = np.cumsum(rng.standard_normal((2, 3000)), axis=1)
+        first, second = (w / w.std() for w in waves)
+        z = own_noise(rng, 3000, 4) * loud + 3.0 * np.outer(first, rng.standard_normal(12))
+        each = [z, z + 3.0 * np.outer(second, rng.standard_normal(12))]
+        for whole in each:
+            test = strongest(whole @ basis, basis, by_sensor(4))
+            factors = with_factor(test.covariance, basis, by_sensor(4), test.alone)
+            strengths.append(second_factor(test, basis, factors))
+    one, two = np.reshape(strengths, (-1, 2)).T
+    assert np.count_nonzero(one) <= 1  # one test in a thousand
+    assert np.count_nonzero(two) >= 30
 
 
 def test_a_factor_is_told_from_noise_and_its_direction_found() -> None:

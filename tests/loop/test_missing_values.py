@@ -10,10 +10,11 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
-from loop_cases import RECIPE, Array, scenario, survey_file, synthetic
+from loop_cases import RECIPE, Array, loaded, scenario, survey_file, synthetic
 
 from magtensor.applying import apply_and_refine
 from magtensor.calibration.types import ArrayCalibration
+from magtensor.errors import NotEnoughData
 from magtensor.loop.correcting.another_survey import Here
 from magtensor.loop.correcting.filled import filled
 from magtensor.preparing import empty_survey
@@ -180,3 +181,18 @@ def test_the_others_are_brought_back_to_their_time_meanwhile(tmp_path: Path, sil
     assert moved[:, OTHERS].max() < 0.1 * NOISE_NT
     far = np.delete(moved[:, 2], np.r_[SILENT.start - 6 : SILENT.stop + 6], axis=0)  # from where a spline forgets it
     assert far.max() < NOISE_NT
+
+
+def test_where_some_sensor_is_silent_at_all_times_there_is_nothing_to_search(tmp_path: Path) -> None:
+    """With a channel logged beside them, of which no sample is left either."""
+
+    def change(path: Path) -> None:
+        with h5py.File(path, "r+") as survey:
+            raw = survey["b_raw"][:]
+            raw[np.arange(len(raw)), np.arange(len(raw)) % raw.shape[1]] = np.nan
+            survey["b_raw"][...] = raw
+
+    with pytest.raises(
+        NotEnoughData, match="no samples with readings of all sensors and a total field are left in use"
+    ):
+        loaded(tmp_path, scenario(1), change)

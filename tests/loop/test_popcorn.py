@@ -44,6 +44,24 @@ def test_steady_noise_goes_in_no_jumps(kind: str, samples: int) -> None:
     assert np.mean(found > 2.5) < 0.03  # as of what an event is suspected for: one in a hundred
 
 
+@pytest.mark.parametrize("pauses", [3, 12, 40])
+def test_steady_noise_goes_in_no_jumps_across_pauses(pauses: int) -> None:
+    """It goes on while nothing is recorded: what differs before and after by more than usual is no jump."""
+    rng = np.random.default_rng(pauses)
+    within = np.arange(2400) % (2400 // pauses + 1) > 3 * (2400 // pauses) // 4
+    run = np.cumsum(np.diff(within, prepend=False) & ~within)[~within]
+    series = [steady(rng, 2400, "one time constant")[~within] for _ in range(100)]
+    assert max(jumpiness(one, run) for one in series) < JUMPS
+
+
+def test_levels_go_in_jumps_between_pauses_too() -> None:
+    rng = np.random.default_rng(2)
+    run = np.repeat(np.arange(6), 200)
+    found = [jumpiness(levels(rng, 1200, 60.0) * 3.0 + rng.standard_normal(1200), run) for _ in range(50)]
+    assert np.median(found) > JUMPS
+    assert jumpiness(levels(rng, 1200, 60.0), np.repeat(np.arange(200), 6)) == 0.0  # nowhere long enough to ask
+
+
 def test_levels_do() -> None:
     rng = np.random.default_rng(2)
     found = [jumpiness(levels(rng, 1200, 60.0) * 3.0 + rng.standard_normal(1200)) for _ in range(50)]

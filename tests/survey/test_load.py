@@ -15,6 +15,7 @@ from magtensor.survey.model import Survey
 from magtensor.survey.repeated import written_twice
 from magtensor.survey.sections import SurveySection
 from magtensor.survey.source import Source
+from magtensor.survey.time_base import moves_on
 from magtensor_stages import load
 
 Load = Callable[..., Survey]
@@ -75,6 +76,20 @@ def test_time_faults(load_variables: Load, variables: Variables, change: Any, me
     keep = np.isin(variables["time"][1], survey.time)
     np.testing.assert_array_equal(survey.values("b_raw"), variables["b_raw"][1][keep])
     assert "left out whose time does not move on" in survey.attributes["notes"][0]
+
+
+@pytest.mark.parametrize("early", [-1e6, 1.0])
+def test_a_stamp_too_late_and_one_too_early_cost_two_samples(early: float) -> None:
+    time = 0.1 * np.arange(1000)
+    time[100], time[900] = 1e6, early
+    kept = moves_on(time)
+    assert (np.diff(time[kept]) > 0).all()
+    assert list(np.flatnonzero(~kept)) == [100, 900]
+
+
+def test_of_a_clock_that_steps_back_the_samples_before_it_are_kept() -> None:
+    time = 0.1 * np.concatenate([np.arange(600), np.arange(300, 1000)])
+    assert list(np.flatnonzero(~moves_on(time))) == list(range(600, 900))
 
 
 def test_reference_times(load_variables: Load, variables: Variables) -> None:

@@ -13,7 +13,7 @@ from magtensor.calibration.joint import calibrated
 from magtensor.calibration.types import Array
 from magtensor.components import Component
 from magtensor.error_models.needs import missing
-from magtensor.errors import DataError, NotEnoughData, UsageError, did_you_mean
+from magtensor.errors import DataError, UsageError, did_you_mean
 from magtensor.loop.decisions import Decision
 from magtensor.loop.fitting.model import Adopted, Fitting, Record, State, as_declared
 from magtensor.loop.fitting.record import record_of
@@ -345,8 +345,6 @@ def inquiry_of(
         NotEnoughData: no samples are left in use.
     """
     record = record_of(survey)
-    if len(record.time) < 2:
-        raise NotEnoughData("no samples are left in use", where=str(survey.attributes.get("source", "")))
     begin = as_declared(declared.values(), record.time)
     names = {a.name for a in begin}
     open_ = [m for m in models if m.name not in names]

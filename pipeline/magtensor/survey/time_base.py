@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,7 +16,9 @@ def moves_on(time: Floats) -> Bools:
     """(N,) True for the samples to keep so that the time increases.
 
     Either a sample must be later than all before it (a clock that steps back), or earlier than all after it (one
-    stamp that is far too late); whichever keeps more samples. A missing time is False.
+    stamp that is far too late); whichever keeps more samples. Where both lose more than twice as many as need be, as
+    where one stamp is far too late and another far too early, the most samples are kept that can be. A missing time is
+    False.
     """
     known = np.isfinite(time)
     latest = np.maximum.accumulate(np.where(known, time, -np.inf))
@@ -23,7 +26,27 @@ def moves_on(time: Floats) -> Bools:
     forward, backward = known.copy(), known.copy()
     forward[1:] &= time[1:] > latest[:-1]
     backward[:-1] &= time[:-1] < earliest[1:]
-    return backward if backward.sum() > forward.sum() else forward
+    kept = backward if backward.sum() > forward.sum() else forward
+    if kept.sum() == known.sum():
+        return kept
+    most = _longest_increasing(time, known)
+    return most if (known & ~kept).sum() > 2 * (known & ~most).sum() else kept
+
+
+def _longest_increasing(time: Floats, known: Bools) -> Bools:
+    """(N,) True for the samples of the longest series of increasing stamps, of several one (Schensted 1961)."""
+    ends, last, before = list[float](), list[int](), np.full(len(time), -1)
+    for i in map(int, np.flatnonzero(known)):
+        place = bisect_left(ends, time[i])
+        before[i] = last[place - 1] if place else -1
+        ends[place : place + 1] = [time[i]]
+        last[place : place + 1] = [i]
+    chosen = np.zeros(len(time), dtype=bool)
+    i = last[-1] if last else -1
+    while i >= 0:
+        chosen[i] = True
+        i = int(before[i])
+    return chosen
 
 
 @dataclass(frozen=True)

@@ -20,9 +20,16 @@ LEAST_BAND = 6  # coefficients of the lowest band for each value across
 
 @dataclass(frozen=True)
 class BandTest:
-    """The band that speaks most clearly against noise of the groups alone."""
+    """The band that speaks most clearly against noise of the groups alone.
+
+    Attributes:
+        band: number of its highest cosine frequency.
+        effective: coefficients of one colour, and of one strength all the time, that would tell as much.
+        covariance: of the values across; alone: as noise of the groups makes it; p: of the test.
+    """
 
     band: int
+    effective: float
     covariance: Array
     alone: Factors
     p: float
@@ -43,7 +50,7 @@ def strongest(white: Array, basis: Array, groups: Groups) -> BandTest:
         alone = noise_alone(covariance, basis, groups)
         effective = _effective(own, lowest(white, band), covariance)
         p = min(1.0, float(np.exp(alone.log_p(effective))) * len(bands))
-        tests.append(BandTest(band, covariance, alone, p))
+        tests.append(BandTest(band, effective, covariance, alone, p))
     return max(tests, key=lambda t: t.band * t.alone.deviance)
 
 
@@ -93,10 +100,10 @@ def second_factor(test: BandTest, basis: Array, factors: Factors) -> float:
     if factors.freedom == 0:  # three sensors: only noise of each output alone leaves anything to disagree
         alone = noise_alone(test.covariance, basis, by_output(basis))
         factors = with_factor(test.covariance, basis, by_output(basis), alone)
-    if factors.log_p(test.band) > np.log(ALPHA):
+    if factors.log_p(test.effective) > np.log(ALPHA):
         return 0.0
-    first = alone.deviance - factors.deviance - (alone.freedom - factors.freedom) / test.band
-    second = factors.deviance - factors.freedom / test.band
+    first = alone.deviance - factors.deviance - (alone.freedom - factors.freedom) / test.effective
+    second = factors.deviance - factors.freedom / test.effective
     return second / max(first, 1e-300)
 
 

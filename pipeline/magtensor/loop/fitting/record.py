@@ -13,6 +13,7 @@ from magtensor.calibration.types import Array
 from magtensor.error_models.held_logs import LEAST_HELD, LEAST_READINGS
 from magtensor.error_models.quiet import quieted
 from magtensor.error_models.station import Station
+from magtensor.errors import NotEnoughData
 from magtensor.loop.fitting.model import Record
 from magtensor.survey.model import Survey
 from magtensor.survey.recorded_numbers import resolution
@@ -45,6 +46,9 @@ def record_of(
         every: all samples, flagged or not, as a correction needs; else those a fit may use.
         use: (N,) those samples, where a fit of several surveys has chosen them. Channels that never change are then
             kept: another survey may hold another value.
+
+    Raises:
+        NotEnoughData: no samples are left in use.
     """
     raw = np.asarray(survey.values("b_raw"), dtype=float)
     time = survey.time
@@ -75,6 +79,9 @@ def record_of(
             else:
                 logged[name] = _filled(time, values, finite)
     keep = np.flatnonzero(use)
+    if len(keep) < 2:
+        needed = "readings of all sensors" + " and a total field" * (total_field is not None)
+        raise NotEnoughData(f"no samples with {needed} are left in use", where=str(survey.attributes.get("source", "")))
     if origins is None:
         origins = {name: origin(values[keep], units[name]) for name, values in logged.items()}
     centred = {name: values - origins[name] for name, values in logged.items() if name in origins}

@@ -28,8 +28,7 @@ from magtensor.sharing import shared_out
 COSINES = 4  # over the survey: slower than any block is long
 BLOCKS = 40  # longer than what noise can be expected to remember beyond its fitted colour
 LEAST_SAMPLES = 120  # three in a block
-SLOW = "cosines"
-JUMP = " jump"  # no channel has that name
+SLOW = "/cosines"  # no name of a channel has a slash
 
 
 @dataclass(frozen=True)
@@ -38,7 +37,7 @@ class ChangingMatrix:
 
     Attributes:
         sensors: its name, first; after it those that the data do not tell from it.
-        waveform: the logged channel that its matrix follows, `SLOW` where none does better than slow functions of time.
+        waveform: the logged channel that its matrix follows; `SLOW` where none does better.
         gain: on held-out blocks, in noise of the residual's own colour.
         rms: nT over all outputs, of what is explained.
     """
@@ -102,10 +101,12 @@ def channel_instead(state: State, terms: Terms, colours: Colours, since_s: float
         given = np.arange(blocks.count) < blocks.count - more.count
         return interleaved_gain(blocks, residual.freedom, given, np.ones(blocks.count, dtype=bool)).total
 
-    channels[JUMP] = (x.elapsed >= since_s).astype(float)[:, None, None]
-    products = {n: joined([_products(x, i, w) for i in numbers]).at(residual.samples) for n, w in channels.items()}
-    gains = {name: gain(more) - more.count for name, more in products.items()}
-    jumped = max(gains.pop(JUMP), gain(terms))
+    def of_products(waveform: Array) -> float:
+        more = joined([_products(x, i, waveform) for i in numbers]).at(residual.samples)
+        return gain(more) - more.count
+
+    jumped = max(of_products((x.elapsed >= since_s).astype(float)[:, None, None]), gain(terms))
+    gains = {name: of_products(waveform) for name, waveform in channels.items()}
     best = max(gains, key=lambda name: gains[name])
     return best if gains[best] > jumped + SEPARATION else ""
 

@@ -19,7 +19,8 @@ MEANS = 8  # samples that are taken together to see what is slow
 def popcorn_words(state: State) -> list[str]:
     """The sensor, of two both, what is left of which goes in jumps most, along one direction, and by how much; nothing
     where none does."""
-    residual, sensors = state.residual, state.excitation.sensors
+    residual, x = state.residual, state.excitation
+    sensors, run = x.sensors, x.run[residual.samples]
     if residual.across is None:
         return []
     most, words = 0.0, list[str]()
@@ -31,7 +32,7 @@ def popcorn_words(state: State) -> list[str]:
         direction = np.linalg.svd(slow - slow.mean(axis=0), full_matrices=False)[2][0]
         along = own @ direction
         beyond = float(np.sqrt(max(np.mean(along**2) - seen[number], 0.0)))
-        if beyond < max(most, SLOW * float(np.sqrt(seen[number]))) or jumpiness(along) < JUMPS:
+        if beyond < max(most, SLOW * float(np.sqrt(seen[number]))) or jumpiness(along, run) < JUMPS:
             continue
         vector = direction * residual.noise[3 * number : 3 * number + 3]
         amount = beyond / seen[number] * float(np.linalg.norm(vector))

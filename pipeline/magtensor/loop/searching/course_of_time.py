@@ -39,7 +39,7 @@ MORE = 1e-5  # the same of them beside a channel: slow noise is not known to bet
 MORE_OF_ITS_OWN = 2.0  # times what they explain beside a channel that it explains beside them, if both do
 OF_ITS_OWN = 0.05  # of what a channel explains, that they do not: less than a quarter of its size
 MISSED = 0.1  # of the sum of squares, by the law of a drift: a third of its size, as a line misses of what slows down
-THE_FIELD = "the field"  # no channel has that name
+THE_FIELD = "/the field"  # no name of a channel has a slash
 STEP = 0.01  # of a setting, over which the change of what it explains is taken
 
 
@@ -66,12 +66,14 @@ def beside_time(candidate: Candidate, state: State) -> BesideTime:
         return BesideTime(True)
     x, name = before.excitation, compared.name
     if candidate.assessment.gain.total <= MISSED * explained_by_courses(state, candidate):
-        return BesideTime(False, f"{name} explains nothing beside smooth courses of time, and a drift is adopted")
+        return BesideTime(
+            False, f"{compared.said} explains nothing beside smooth courses of time, and a drift is adopted"
+        )
     if compared.of_time:
-        return BesideTime(False, f"smooth courses of time explain more than {name}, and leave it nothing")
+        return BesideTime(False, f"smooth courses of time explain more than {compared.said}, and leave it nothing")
     if name != THE_FIELD and hardly_begun(model, x):
         return BesideTime(
-            False, f"{name}, seen through a lag of more than half of the survey, is a drift like any other"
+            False, f"{compared.said}, seen through a lag of more than half of the survey, is a drift like any other"
         )
     return BesideTime(False)
 
@@ -88,7 +90,7 @@ def outweighed(state: State, which: int) -> str:
         return ""
     if compared.channel > MORE_OF_ITS_OWN * compared.time:
         return ""
-    return f"fitted, smooth courses of time explain as much beside {compared.name} as it does beside them"
+    return f"fitted, smooth courses of time explain as much beside {compared.said} as it does beside them"
 
 
 @dataclass(frozen=True)
@@ -109,6 +111,11 @@ class _Compared:
     whole: float
     seen: bool
     of_time: bool
+
+    @property
+    def said(self) -> str:
+        """The name in words."""
+        return self.name.removeprefix("/")
 
 
 def _compared(model: Adopted, theta: Array, before: State) -> _Compared | None:

@@ -28,7 +28,7 @@ MOST = 0.5  # of what a candidate explains
 POWERS = 6  # of time and of a channel: more than any law of an effect that has a name
 NEXT = 2  # samples: that a jump seems to be away while another part of it has no name
 MISSED = 0.01  # of the squares of an event that is held by another: some samples between the two
-TIME = " time"  # no channel has that name
+TIME = "/time"  # no name of a channel has a slash
 DEGREE = "degree"  # of a field of the site that is cut off there: what it lacks goes with the attitude
 
 

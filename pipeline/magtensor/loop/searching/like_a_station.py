@@ -43,7 +43,7 @@ def as_a_station_would(state: State, place: int) -> bool:
     of |b| - F, and next to nothing of this beside courses that all sensors see alike. What a vector in their axes makes
     turns with the platform: no station does that.
     """
-    single = state.residual.across is None
+    single = len(state.excitation.sensors) == 1
     if state.residual.along is None or (single and not a_tone(state.adopted[place])):
         return False
     assert state.terms is not None
@@ -52,7 +52,7 @@ def as_a_station_would(state: State, place: int) -> bool:
     others = state.terms.only(i for i in numbers if not own.start <= i < own.stop)
     back, colours = put_back(state.residual, mine, state.theta[place]), state.colours
     along = replace(back, across=None)
-    if not single:
+    if state.residual.across is not None:
         apart, by_chance = _beyond(replace(back, along=None), colours, mine, [others])
         if by_chance <= APART_ALPHA and apart > HARDLY * _beyond(along, colours, mine, [others])[0]:
             return False

@@ -277,6 +277,7 @@ def of_what_jumps(state: State, fixed: int) -> tuple[list[int], str] | None:
     residual = state.residual
     if residual.across is None:
         return None
+    run = state.excitation.run[residual.samples]
     for place, model in enumerate(state.adopted):
         vector = _vector(state, place) if place >= fixed and happens_once(model) else None
         if vector is None:
@@ -285,7 +286,7 @@ def of_what_jumps(state: State, fixed: int) -> tuple[list[int], str] | None:
         size = float(np.linalg.norm(seen))
         stays = residual.across @ seen / size if size > 0.0 else np.zeros(len(residual.across))
         beyond = max(float(np.mean(stays**2)) - 1.0, 0.0) ** 0.5
-        if beyond > SLOW and size < STANDS_OUT * beyond and jumpiness(stays) > JUMPS:
+        if beyond > SLOW and size < STANDS_OUT * beyond and jumpiness(stays, run) > JUMPS:
             places = [i for i, v in _events(state, fixed) if i == place or _along(v, vector) or _along(vector, v)]
             amount = beyond / size * float(np.sqrt(np.mean(vector[vector != 0.0] ** 2)))
             return places, f"what stays along its vector goes in jumps too, of {amount:.3g} nT rms"

@@ -174,7 +174,7 @@ class Rounds:
             if kept.standing is not None:
                 steps.append(kept.step(state, [kept.chosen] if kept.chosen else []))
                 record, state = renewed(record, kept.standing.state, how)
-                standing = replace(kept.standing, state=state)
+                shared, standing = None, replace(kept.standing, state=state)
                 continue
             shared, found = self.with_source(record, state, how, steps[-1], shared)
             if found is None:

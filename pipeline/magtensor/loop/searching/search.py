@@ -91,7 +91,7 @@ def search(
     fewer = bool((state.fit.keep & ~last.fit.keep).any())
     if over or fewer:  # what only these samples asked for goes with them
         last, steps = _weighed_once_more(record, last, steps, how, len(declared))
-    shared = sought(last, record) if ended.shared is None or fewer else ended.shared
+    shared = sought(last, record) if ended.shared is None or last is not ended.settled else ended.shared
     evenly = unweighed(record, last, how)
     not_tested = _not_tested(last.excitation, models)
     found = Search(first, last, steps, not_tested, rounds.failed, record, shared, how, evenly)
@@ -165,7 +165,7 @@ def _without_those_that_wander(ended: Ended, rounds: Rounds) -> Ended:
         return ended
     how = replace(ended.how, noise=all_noise(ended.settled))
     again = joint_state(ended.record, ended.state.adopted, how, ended.state.theta, ended.state.lines)
-    return replace(ended, state=again, how=how)
+    return replace(ended, state=again, how=how, shared=None)
 
 
 def _among(names: tuple[str, ...], ended: Ended, rounds: Rounds) -> Ended | None:

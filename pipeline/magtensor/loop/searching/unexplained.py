@@ -291,10 +291,11 @@ def strongest_line(state: State, record: Record, *, between: bool = False) -> tu
 def _where(state: State) -> str:
     """Words for where most of what is left is."""
     residual = state.residual
-    if residual.across is None or residual.along is None:
+    if residual.along is None or len(state.excitation.sensors) == 1:
         return _on_sensors(state)
-    count = len(residual.along)
-    between = float(np.sum(residual.across**2)) - count * (residual.freedom - 1)
+    count, between = len(residual.along), 0.0
+    if residual.across is not None:
+        between = float(np.sum(residual.across**2)) - count * (residual.freedom - 1)
     if float(np.sum(residual.along**2)) - count > max(between, 0.0):
         return f"mostly in |b| - F{', alike in all sensors' * _seen_alike(state.residual)}"
     return _on_sensors(state)
