@@ -15,7 +15,7 @@ from magtensor.error_models.terms import Terms
 from magtensor.loop.fitting.model import Adopted, Fitting, Record, State
 from magtensor.loop.fitting.refit import joint_state
 from magtensor.loop.fitting.separation import SECOND_ORDER
-from magtensor.loop.searching import by_hand, outcome, rivals, rounds
+from magtensor.loop.searching import by_hand, choosing, outcome, rivals, rounds
 from magtensor.loop.searching.course_of_time import BesideTime
 from magtensor.loop.searching.gates import ALPHA, Candidate, explained_by
 from magtensor.loop.searching.keeping import ONE_OF_A_KIND, Fitted
@@ -105,7 +105,7 @@ def test_of_every_model_it_is_told_why_it_was_not_adopted(tmp_path: Path, monkey
     """The first candidate is refused and all others are said to be parts of it, so that nothing is adopted; most
     explain too little to be looked at closely."""
     monkeypatch.setattr(rounds, "fitted", lambda *_: Fitted(None, "refused"))
-    monkeypatch.setattr(rounds, "part_of", lambda *_: True)
+    monkeypatch.setattr(choosing, "part_of", lambda *_: True)
     survey = scenario(33, *EFFECTS, motion=BASE["motion"] | {"duration_s": 600.0})
     told = verdict_of(tmp_path, survey, models=lasting_effects())
 
@@ -122,6 +122,26 @@ def test_of_every_model_it_is_told_why_it_was_not_adopted(tmp_path: Path, monkey
     assert screened and not screened & {c["error_model"] for step in told["steps"] for c in step["looked_at"]}
 
 
+def nothing_said(monkeypatch: pytest.MonkeyPatch, **does: Any) -> None:
+    """Nothing is said against a candidate before it is fitted, or what is given by name."""
+    silent: dict[str, Any] = {
+        **dict.fromkeys(("containing",), lambda best, *_: best),
+        **dict.fromkeys(("simplest", "nearest"), lambda chosen, *_: (chosen, ())),
+        **dict.fromkeys(("part_of_a_drift", "hindered_by_another"), lambda *_: None),
+        **dict.fromkeys(("rate_instead", "part_of_a_larger_law", "part_of_a_gradient"), lambda *_: ""),
+        **dict.fromkeys(("outdone_by", "part_of_a_waveform"), lambda *_: ""),
+        **dict.fromkeys(("as_predictive", "by_a_worse_log"), lambda *_: set()),
+        **dict.fromkeys(("switched_with", "channels_in_time"), lambda *_: ()),
+        "beside_time": lambda *_: BesideTime(True),
+        "is_a_course": lambda *_: False,
+    }
+    for name, what in (silent | does).items():
+        modules = [m for m in (choosing, rounds) if hasattr(m, name)]
+        assert modules, name
+        for module in modules:
+            monkeypatch.setattr(module, name, what)
+
+
 @pytest.mark.parametrize("why", [ONE_OF_A_KIND, "fitted, it raises the held-out error of S1"])
 def test_what_another_width_of_an_adopted_law_explains_is_no_other_effect(
     why: str, monkeypatch: pytest.MonkeyPatch
@@ -135,28 +155,8 @@ def test_what_another_width_of_an_adopted_law_explains_is_no_other_effect(
         tried.append(chosen.model.name)
         return Fitted(None, why if chosen is width else "it leaves more than it takes away")
 
-    def unchanged(chosen: Any, *_: Any) -> tuple[Any, tuple[str, ...]]:
-        return chosen, ()
-
-    monkeypatch.setattr(rounds, "fitted", fitted)
-    monkeypatch.setattr(rounds, "containing", lambda best, *_: best)
-    monkeypatch.setattr(rounds, "simplest", unchanged)
-    monkeypatch.setattr(rounds, "nearest", unchanged)
-    monkeypatch.setattr(rounds, "switched_with", lambda *_: ())
-    monkeypatch.setattr(rounds, "outdone_by", lambda *_: "")
-    monkeypatch.setattr(rounds, "part_of_a_waveform", lambda *_: "")
-    monkeypatch.setattr(rounds, "rate_instead", lambda *_: "")
-    monkeypatch.setattr(rounds, "hindered_by_another", lambda *_: None)
-    monkeypatch.setattr(rounds, "as_predictive", lambda *_: set())
-    monkeypatch.setattr(rounds, "by_a_worse_log", lambda *_: set())
-    monkeypatch.setattr(rounds, "part_of_a_larger_law", lambda *_: "")
-    monkeypatch.setattr(rounds, "part_of_a_gradient", lambda *_: "")
-    monkeypatch.setattr(rounds, "part_of_a_drift", lambda *_: None)
-    monkeypatch.setattr(rounds, "beside_time", lambda *_: BesideTime(True))
-    monkeypatch.setattr(rounds, "is_a_course", lambda *_: False)
-    monkeypatch.setattr(rounds, "channels_in_time", lambda *_: [])
-    monkeypatch.setattr(rounds, "part_of", lambda *_: False)
-    monkeypatch.setattr(rounds, "overlaps", lambda c, failed, _: failed is width and c is creep)
+    overlap = {"part_of": lambda *_: False, "overlaps": lambda c, failed, _: failed is width and c is creep}
+    nothing_said(monkeypatch, fitted=fitted, **overlap)
     for each in (width, creep, other):
         each.predicts = True
     given: Any = SimpleNamespace(state=SimpleNamespace(excitation=None))
@@ -183,28 +183,12 @@ def test_of_one_name_the_curve_of_another_channel_is_still_tried(monkeypatch: py
         asked.append(channel)
         return [curve]
 
-    unchanged: Any = lambda chosen, *_: (chosen, ())  # noqa: E731
-    for name, does in {
-        "fitted": lambda *_: Fitted(None, "refused"),
-        "containing": lambda best, *_: best,
-        "simplest": unchanged,
-        "nearest": unchanged,
-        "switched_with": lambda *_: (),
-        "part_of_a_larger_law": lambda *_: "",
-        "part_of_a_gradient": lambda *_: "",
-        "part_of_a_drift": lambda *_: None,
-        "rate_instead": lambda *_: "",
-        "hindered_by_another": lambda *_: None,
-        "as_predictive": lambda *_: set(),
-        "by_a_worse_log": lambda *_: set(),
-        "beside_time": lambda *_: BesideTime(True),
-        "is_a_course": lambda *_: False,
-        "channels_in_time": lambda *_: [],
-        "outdone_by": lambda chosen, _: "wind" if chosen is line else "",
-        "part_of_a_waveform": lambda *_: "",
-        "by_any_law_of": curves,
-    }.items():
-        monkeypatch.setattr(rounds, name, does)
+    nothing_said(
+        monkeypatch,
+        fitted=lambda *_: Fitted(None, "refused"),
+        outdone_by=lambda chosen, _: "wind" if chosen is line else "",
+        by_any_law_of=curves,
+    )
     given: Any = SimpleNamespace(state=SimpleNamespace(excitation=None, adopted=()))
     monkeypatch.setattr(rounds.Rounds, "open_models", lambda *_: [])
     search = rounds.Rounds([], 0, 8, 0.005, None, None)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 from magtensor.components import Component
 from magtensor.error_models.excitation import Excitation
@@ -12,63 +13,44 @@ from magtensor.loop.fitting.model import CHANNEL, Fitting, Record, State
 from magtensor.loop.fitting.refit import settled
 from magtensor.loop.fitting.trial import Trial, on_the_folds_of, trial
 from magtensor.loop.remainder.predictable import by_what_they_read
-from magtensor.loop.remainder.tones import channels_of_the_line, tones
+from magtensor.loop.remainder.tones import tones
 from magtensor.loop.searching.another_lag import with_another_lag
-from magtensor.loop.searching.any_law import OUTPUTS, at_an_end, by_a_curve, by_any_law, by_any_law_of, outdone_by
+from magtensor.loop.searching.any_law import OUTPUTS, at_an_end, by_a_curve, by_any_law, by_any_law_of
 from magtensor.loop.searching.beside_a_hole import of_a_hole
-from magtensor.loop.searching.contribution import eliminate, tones_of, without_models
+from magtensor.loop.searching.choosing import Choosing
+from magtensor.loop.searching.contribution import eliminate, without_models
 from magtensor.loop.searching.course_of_time import (
     beside_time,
-    channels_in_time,
-    is_a_course,
-    responses_like,
-    rivals_in_time,
 )
 from magtensor.loop.searching.exchange import exchanged, looked_at_again
 from magtensor.loop.searching.found import Ended, Kept, Step
 from magtensor.loop.searching.gates import Candidate
 from magtensor.loop.searching.keeping import (
-    MAYBE_HEAT,
-    NOT_AS_ASSUMED,
-    OF_AN_AXIS,
-    ONE_OF_A_KIND,
     UNEARNED,
     Fitted,
     fitted,
     fitted_everywhere,
     why_not,
 )
-from magtensor.loop.searching.larger_law import follows_the_attitude, part_of_a_gradient, part_of_a_larger_law
+from magtensor.loop.searching.larger_law import part_of_a_gradient, part_of_a_larger_law
 from magtensor.loop.searching.latent import NAME, Sought, renewed, sought, source_instead, tried_source
 from magtensor.loop.searching.like_a_station import stations_like
 from magtensor.loop.searching.likeness import followed_by_a_curve, part_of_the_source
 from magtensor.loop.searching.on_fewer_sensors import on_those_needed
 from magtensor.loop.searching.on_more_sensors import in_the_place_of_others, on_more_sensors
 from magtensor.loop.searching.own_fit import at_their_own_fit
-from magtensor.loop.searching.part_of_a_waveform import part_of_a_waveform
 from magtensor.loop.searching.profiling import repeatable
 from magtensor.loop.searching.rivals import (
-    as_predictive,
-    by_a_worse_log,
-    containing,
-    events_like,
     hardly_less,
     hindered_by_another,
-    overlaps,
-    part_of,
     part_of_a_drift,
-    simplest,
-    stands_for_less,
 )
 from magtensor.loop.searching.screening import candidates_of
 from magtensor.loop.searching.split import split
-from magtensor.loop.searching.switched_with import of_no_law, switched_with
 from magtensor.loop.searching.unknown_rate import rate_instead
-from magtensor.loop.searching.which_channel import nearest
 
 ROUNDING = 1e-4  # mean square of the whitened residual: far below the least noise that any sensor is believed to have
 MOST_BESIDE = 2  # fits of another beside what fails alone: of two that hinder each other each is the first to be seen
-AS_LASTING = "{}, which lasts, predicts as much"
 
 
 @dataclass
@@ -196,80 +178,27 @@ class Rounds:
     ) -> Kept:
         """Fit the candidates that pass, found among so many models, the best first, until one is kept, or so many have
         been; one that fails on held-out blocks, before it is fitted or after, may be kept with another beside it."""
-        refused: dict[str, str] = {}
-        asked: set[str] = set()  # channels whose curves have had their turn
-        outdone: list[Candidate] = []
-        courses: list[Candidate] = []  # that are no more than smooth courses of time
+        state = before.state
         anything = next((m for m in self.models if m.name == CHANNEL), None)
-        left, fits = list(candidates), 0
-
-        def refuse(name: str, why: str) -> None:
-            refused[name] = why
-            left[:] = [c for c in left if c.model.name != name]
-
-        def ask(channels: Iterable[str]) -> bool:
-            """Whether there are curves that had not had their turn."""
-            new = sorted(set(channels) - asked)
-            asked.update(new)
-            left.extend(c for channel in new for c in self.curves_of(channel, before.state))
-            return bool(new)
-
+        choosing = Choosing(
+            record, state, candidates, models, partial(self.curves_of, state=state),
+            partial(self.of_another, state=state), anything,
+        )  # fmt: skip
+        fits = 0
         while True:
-            passing = [c for c in left if c.passes]
-            best = max(passing, key=lambda c: c.assessment.gain.total, default=None)
-            if with_others and (hindered := hindered_by_another(best, left, before.state)):
+            best = choosing.best
+            if with_others and (hindered := hindered_by_another(best, choosing.left, state)):
                 with_others = False
                 if two := self.kept_with_another(record, before, hindered, candidates, how, models):
-                    return replace(two, refused=refused)
+                    return replace(two, refused=choosing.refused)
             if best is None:
-                unlike = [c for c in left if c.unlike_its_law]
-                if ask({name for c in unlike for name in c.model.channels(before.state.excitation)}):
+                if choosing.asks_for_other_laws():
                     continue
                 break
-            possible = [c for c in left if c.predicts]
-            best = containing(best, possible, before.state)
-            chosen, rivals = simplest(best, possible, before.state)
-            lawful = [c for c in candidates if refused.get(c.model.name) != NOT_AS_ASSUMED]
-            if lasting := part_of_a_drift(chosen, lawful, before.state):
-                refuse(chosen.model.name, AS_LASTING.format(lasting.model.name))
-                left[:] = [lasting if c.model.name == lasting.model.name else c for c in left]
+            proposal = choosing.proposed(best)
+            if proposal is None:
                 continue
-            if why := self.of_another(chosen, before.state) or part_of_a_waveform(chosen, before.state, record):
-                refuse(chosen.model.name, why)
-                if follows_the_attitude(chosen.model, before.state):
-                    ask([OUTPUTS])
-                continue
-            switched = switched_with(chosen.model, before.state)
-            if ask(switched):
-                continue
-            if why := of_no_law(chosen, switched, [*candidates, *left], before.state):
-                refuse(chosen.model.name, why)
-                continue
-            x = before.state.excitation
-            if is_a_course(chosen.model, x) and ask(name for name in x.logged if not x.is_vector(name)):
-                continue  # what rises with time may be any curve of what did
-            chosen, channels = nearest(chosen, before.state, models, anything)
-            frequencies = tones_of(chosen.model)
-            of_a_tone = [c for f in frequencies for c in channels_of_the_line(x, f)]
-            in_time = channels_in_time(chosen, before.state)
-            if same := (*switched, *of_a_tone, *in_time):
-                channels, rivals = same, tuple(sorted({*rivals, CHANNEL}))
-            time = beside_time(chosen, before.state)
-            if time.refused:
-                refuse(chosen.model.name, time.refused)
-                courses.append(chosen)
-                continue
-            if channel := outdone_by(chosen, before.state):
-                outdone.append(chosen)
-                refuse(chosen.model.name, f"any curve of {channel} explains more")
-                ask([channel])
-                continue
-            alike = as_predictive(chosen, candidates, before.state) | by_a_worse_log(chosen, outdone, before.state)
-            in_it = [c for c in candidates if refused.get(c.model.name) == AS_LASTING.format(chosen.model.name)]
-            alike |= events_like(chosen, in_it, before.state) | responses_like(chosen, courses, before.state)
-            rivals = tuple(sorted({*rivals, *alike}))
-            if not time.seen:
-                rivals = tuple(sorted({*rivals, *rivals_in_time(chosen, possible, before.state)}))
+            chosen, rivals, channels = proposal.chosen, proposal.rivals, proposal.channels
             if (fits := fits + 1) > (most_fits or fits):
                 break
             if self.say is not None:
@@ -278,29 +207,14 @@ class Rounds:
             if (tried.hurt or tried.why == UNEARNED) and with_others:
                 with_others = False  # a search beside it takes as long as a round
                 if two := self.with_another(record, before, chosen, tried, how):
-                    return replace(two, rivals=rivals, channels=channels, refused=refused)
+                    return replace(two, rivals=rivals, channels=channels, refused=choosing.refused)
             if tried.after is None or tried.why:
-                refuse(chosen.model.name, tried.why)
-                if tried.why == OF_AN_AXIS:
-                    ask([OUTPUTS])
-                for c in candidates if tried.why == NOT_AS_ASSUMED else ():
-                    if refused.get(c.model.name) == AS_LASTING.format(chosen.model.name):
-                        del refused[c.model.name]
-                        left.append(c)
-                for c in list(left) if tried.why != UNEARNED else ():
-                    if not c.passes:
-                        continue
-                    if part_of(c, chosen, before.state):
-                        refuse(c.model.name, f"a small part of what {chosen.model.name} explains, which failed")
-                    elif tried.why == ONE_OF_A_KIND and overlaps(c, chosen, before.state):
-                        refuse(c.model.name, f"most of it is what the law of {chosen.model.name} leaves")
-                    elif tried.why == MAYBE_HEAT and stands_for_less(c, chosen, before.state):
-                        refuse(c.model.name, f"{chosen.model.name} explains the same and more, and failed")
+                choosing.fails(chosen, tried.why)
                 continue
-            alike = stations_like(tried.after.state, self.models) | hardly_less(chosen, dropped, before.state)
+            alike = stations_like(tried.after.state, self.models) | hardly_less(chosen, dropped, state)
             rivals = tuple(sorted({*rivals, *alike}))
-            return Kept(tried.after, chosen, rivals, channels, dropped, refused)
-        return Kept(None, refused=refused)
+            return Kept(tried.after, chosen, rivals, channels, dropped, choosing.refused)
+        return Kept(None, refused=choosing.refused)
 
     def eliminated(
         self, record: Record, before: Trial, chosen: Candidate, tried: Fitted, how: Fitting
