@@ -8,24 +8,31 @@ import numpy as np
 import pytest
 from loop_cases import linear_state, looked_at, synthetic
 
-from magtensor.loop.fitting.model import Adopted, State
+from magtensor.loop.fitting.model import Adopted, Record, State
 from magtensor.loop.searching.by_its_name import by_its_name
+from magtensor.loop.searching.choosing import Choosing
 from magtensor.loop.searching.gates import Candidate
+from magtensor.loop.searching.keeping import UNEARNED
 from magtensor.registry import Registry
 
 SAMPLES = 1200
 CHANNELS = {"current_heater": "A", "temperature": "degC"}
 
 
-def state() -> State:
+def record() -> Record:
     rng = np.random.default_rng(5)
     logged = {
         "current_heater": (np.cumsum(rng.uniform(size=SAMPLES) < 0.03) % 2).astype(float),
         "temperature": 20.0 + np.sin(np.arange(SAMPLES) / 150.0),
     }
     added = 4.0 * logged["current_heater"][:, None, None] * rng.standard_normal((4, 3))
-    record = synthetic(6, SAMPLES, added=added)
-    return linear_state(replace(record, logged=logged, origins=dict.fromkeys(logged, 0.0), units=CHANNELS))
+    return replace(
+        synthetic(6, SAMPLES, added=added), logged=logged, origins=dict.fromkeys(logged, 0.0), units=CHANNELS
+    )
+
+
+def state() -> State:
+    return linear_state(record())
 
 
 def looked(at: State, name: str, **settings: object) -> Candidate:
@@ -65,3 +72,18 @@ def test_another_law_or_channel_stays_what_it_is() -> None:
         current,
     ):
         assert by_its_name(chosen, [current], at) is chosen
+
+
+def test_it_has_that_name_though_the_effect_was_refused_with_the_settings_it_had() -> None:
+    at = state()
+    lagging = looked(at, "current_field", channel="current_heater", lag_s=3.0)
+    response = looked(at, "channel_response", channel="current_heater")
+    left = Choosing(record(), at, [lagging, response], 2, lambda _: [], lambda _: "", None)
+    left.fails(lagging, UNEARNED)
+    assert left.best is response and left.refused == {"current_field": UNEARNED}
+    proposal = left.proposed(response)
+    assert proposal is not None and proposal.chosen.model.name == "current_field"
+    assert proposal.chosen.model.settings["lag_s"] == 0.0 and "channel_response" in proposal.rivals
+    assert not left.refused  # with these settings
+    left.fails(proposal.chosen, UNEARNED)
+    assert left.best is None and set(left.refused) == {"current_field"}  # nor the response by another name

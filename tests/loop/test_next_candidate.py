@@ -125,7 +125,7 @@ def test_of_every_model_it_is_told_why_it_was_not_adopted(tmp_path: Path, monkey
 def nothing_said(monkeypatch: pytest.MonkeyPatch, **does: Any) -> None:
     """Nothing is said against a candidate before it is fitted, or what is given by name."""
     silent: dict[str, Any] = {
-        **dict.fromkeys(("containing",), lambda best, *_: best),
+        **dict.fromkeys(("containing", "by_its_name"), lambda best, *_: best),
         **dict.fromkeys(("simplest", "nearest"), lambda chosen, *_: (chosen, ())),
         **dict.fromkeys(("part_of_a_drift", "hindered_by_another"), lambda *_: None),
         **dict.fromkeys(("rate_instead", "part_of_a_larger_law", "part_of_a_gradient"), lambda *_: ""),

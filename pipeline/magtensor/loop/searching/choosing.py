@@ -13,6 +13,7 @@ from magtensor.components import Component
 from magtensor.loop.fitting.model import CHANNEL, Record, State
 from magtensor.loop.remainder.tones import channels_of_the_line
 from magtensor.loop.searching.any_law import OUTPUTS, outdone_by
+from magtensor.loop.searching.by_its_name import by_its_name
 from magtensor.loop.searching.contribution import tones_of
 from magtensor.loop.searching.course_of_time import (
     beside_time,
@@ -98,7 +99,8 @@ class Choosing:
         have to be looked at first."""
         possible = [c for c in self.left if c.predicts]
         best = containing(best, possible, self.state)
-        chosen, rivals = simplest(best, possible, self.state)
+        simple, rivals = simplest(best, possible, self.state)
+        chosen = self._by_its_name(simple)
         if self._lasts(chosen) or self._is_of_another(chosen):
             return None
         switched = switched_with(chosen.model, self.state)
@@ -115,7 +117,7 @@ class Choosing:
             return None
         if self._is_outdone(chosen):
             return None
-        alike = set(rivals) | self._like(chosen)
+        alike = {*rivals, simple.model.name, *self._like(chosen)} - {chosen.model.name}
         if not time.seen:
             alike |= set(rivals_in_time(chosen, possible, self.state))
         return Proposal(chosen, tuple(sorted(alike)), channels)
@@ -140,6 +142,15 @@ class Choosing:
                 self._refuse(c.model.name, f"most of it is what the law of {name} leaves")
             elif why == MAYBE_HEAT and stands_for_less(c, chosen, self.state):
                 self._refuse(c.model.name, f"{name} explains the same and more, and failed")
+
+    def _by_its_name(self, simple: Candidate) -> Candidate:
+        """A candidate, in the place of one that says nothing of its cause the effect that is the same thing: that may
+        have been refused, with the settings it had."""
+        named = by_its_name(simple, self.candidates, self.state)
+        if named is not simple:
+            self.left[:] = [named if c is simple else c for c in self.left if c.model.name != named.model.name]
+            self.refused.pop(named.model.name, None)
+        return named
 
     def _refuse(self, name: str, why: str) -> None:
         self.refused[name] = why

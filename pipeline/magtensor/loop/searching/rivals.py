@@ -12,7 +12,6 @@ from magtensor.loop.evidence.assessment import estimated, explained
 from magtensor.loop.fitting.model import Adopted, State, generic
 from magtensor.loop.fitting.separation import SECOND_ORDER, SEPARATION, fold_gain, separated
 from magtensor.loop.searching.beginnings import beginning
-from magtensor.loop.searching.by_its_name import by_its_name
 from magtensor.loop.searching.contribution import happens_once
 from magtensor.loop.searching.gates import OF_THE_LAW, Candidate, explained_by
 from magtensor.loop.searching.several_logs import worse_log
@@ -60,8 +59,7 @@ def simplest(best: Candidate, possible: Sequence[Candidate], state: State) -> tu
     chosen = min((c for c in equal if c is best or c.passes), key=complexity)
     chosen = lasting_instead(chosen, possible)
     rivals = {c.model.name for c in equal if c is not chosen}
-    itself = by_its_name(chosen, possible, state)
-    return itself, tuple(sorted((rivals | {chosen.model.name}) - {itself.model.name}))
+    return chosen, tuple(sorted(rivals - {chosen.model.name}))
 
 
 def by_a_worse_log(chosen: Candidate, others: Sequence[Candidate], state: State) -> set[str]:
