@@ -14,7 +14,9 @@ from magtensor.survey.flags import flag_ranges
 from magtensor_stages.sensors import COMMON, common_frame
 
 if TYPE_CHECKING:
+    from magtensor.calibration.types import ArrayCalibration
     from magtensor.loop.inquiry import Inquiry
+    from magtensor.loop.searching.found import Search
     from magtensor.survey.model import Survey
 
 
@@ -66,20 +68,12 @@ def close_loop(
     take the place of the loop's own. An inquiry that has been made already is used as it stands. Where the attitudes do
     not determine the calibration (level flight), what is known of sensors beforehand stands in, and the result says so.
     """
-    from magtensor.calibration.joint import calibrated
-    from magtensor.calibration.known import facts_of, known_to
     from magtensor.calibration.nominal import Nominal
-    from magtensor.effect_errors import coefficient_variables, with_coefficients
-    from magtensor.loop.correcting.correction import as_elsewhere
-    from magtensor.loop.correcting.stored import SHIFTED, cleaned, effect_variables
     from magtensor.loop.decisions import Decision, decision_of
     from magtensor.loop.evidence.own_noise import OwnNoise
-    from magtensor.loop.fitting import refit
-    from magtensor.loop.fitting.errors_before_after import folds_for, held_out, held_out_error
-    from magtensor.loop.fitting.model import Fitting, unread
+    from magtensor.loop.fitting.model import Fitting
     from magtensor.loop.inquiry import inquiry_of
-    from magtensor.loop.near_nominal import doubt_of, labelled, settled
-    from magtensor.loop.remainder.excess import noise_floor
+    from magtensor.loop.near_nominal import settled
     from magtensor.loop.searching.unexplained import unexplained
     from magtensor.tensors import slow_noise_variables
 
@@ -105,63 +99,112 @@ def close_loop(
     else:
         made = inquiry
         inquiry, found, refused = settled(lambda _: made, made.how, None)
-    begin, how = inquiry.declared, found.how
-    looked_at, keep = found.record, found.last.fit.keep
-    left = unexplained(found, looked_at)
-    folds = folds_for(found.last)
-    first_folds = held_out(looked_at, begin, inquiry.how, found.first.theta, keep, folds)
-    before = held_out_error(looked_at, first_folds, keep)
-    same = len(found.last.adopted) == len(begin)
-    seen = as_elsewhere(looked_at, calibrated(found.last.fit), found.last)
-    after = before
-    if not same:
-        last_folds = held_out(seen, found.last.adopted, how, found.last.theta, keep, folds)
-        after = held_out_error(seen, last_folds, keep)
+    left = unexplained(found, found.record)
     slow = slow_noise_variables(OwnNoise(found.told.residual, None).slow_std())
+    outcome: dict[str, Any] = {"unexplained": left, "held_out": _held_out(inquiry, found)}
     found = inquiry.on_every_sample(found)
-    first, last, record = found.first, refit.with_colour(found.record, found.last, how), found.record
-    calibration, errors = calibrated(last.fit), {}
+    calibration, facts, errors = _calibration(survey, found, refused, all_noise=not left["present"])
+    names = [a.name for a in inquiry.declared]
+    outcome |= {"declared": ["linear", *names], **inquiry.told(found), **facts}
+    return {
+        **_cleaned(survey, found, calibration),
+        **errors,
+        **slow,
+        **_as_declared(survey, inquiry, found),
+        "loop/verdict": ((), json.dumps(outcome, default=float), {}),
+        **_flags(survey, found),
+    }
+
+
+def _held_out(inquiry: Inquiry, found: Search) -> dict[str, Any]:
+    """The errors on held-out blocks, without what was adopted and with it."""
+    from magtensor.calibration.joint import calibrated
+    from magtensor.loop.correcting.correction import as_elsewhere
+    from magtensor.loop.fitting.errors_before_after import folds_for, held_out, held_out_error
+
+    record, keep, folds = found.record, found.last.fit.keep, folds_for(found.last)
+    without = held_out(record, inquiry.declared, inquiry.how, found.first.theta, keep, folds)
+    before = held_out_error(record, without, keep)
+    if len(found.last.adopted) == len(inquiry.declared):
+        return {"before": before, "after": before}
+    seen = as_elsewhere(record, calibrated(found.last.fit), found.last)
+    together = held_out(seen, found.last.adopted, found.how, found.last.theta, keep, folds)
+    return {"before": before, "after": held_out_error(seen, together, keep)}
+
+
+def _calibration(
+    survey: Survey, found: Search, refused: str, *, all_noise: bool
+) -> tuple[ArrayCalibration, dict[str, Any], dict[str, Any]]:
+    """The calibration, what the verdict has to say of how well it is known, and the errors of the coefficients."""
+    from magtensor.calibration.joint import calibrated
+    from magtensor.calibration.known import facts_of, known_to
+    from magtensor.effect_errors import coefficient_variables, with_coefficients
+    from magtensor.loop.fitting.refit import with_colour
+    from magtensor.loop.near_nominal import doubt_of, labelled
+    from magtensor.loop.remainder.excess import noise_floor
+
+    last, errors = with_colour(found.record, found.last, found.how), {}
+    calibration = calibrated(last.fit)
     if last.adopted and last.fit.posterior is None:
         together = with_coefficients(last)
         calibration, errors = together.calibration, coefficient_variables(together, survey.sensors)
     known = known_to(calibration, last.excitation.field[last.fit.keep, 0])
-    doubt = doubt_of(found, how, known, refused)
-    if doubt is not None:
-        calibration = labelled(calibration, doubt)
-    outcome: dict[str, Any] = {
-        "declared": ["linear", *(a.name for a in begin)],
-        "noise_floor_nT": noise_floor(found.told.residual, all_noise=not left["present"]),
-    } | inquiry.told(found)
-    outcome |= {"unexplained": left, "held_out": {"before": before, "after": after}}
-    outcome["calibration"] = doubt.facts() if doubt else facts_of(known, outcome["noise_floor_nT"])
+    floor = noise_floor(found.told.residual, all_noise=all_noise)
+    doubt = doubt_of(found, found.how, known, refused)
+    facts = {"noise_floor_nT": floor, "calibration": doubt.facts() if doubt else facts_of(known, floor)}
+    return labelled(calibration, doubt) if doubt else calibration, facts, errors
+
+
+def _cleaned(survey: Survey, found: Search, calibration: ArrayCalibration) -> dict[str, Any]:
+    """The field in the common frame without the effects, and what is stored of these."""
+    from magtensor.loop.correcting.stored import cleaned, effect_variables
+
+    last, record = found.last, found.record
     undisturbed = np.array(survey.readings)
     undisturbed[record.samples[~last.fit.keep]] = False
-    clean = cleaned(survey, calibration, last.adopted, last.theta, record.origins, undisturbed)
     believed = np.zeros(len(survey.time), dtype=bool)
     believed[record.samples[last.fit.keep]] = True
-    given = common_frame(clean, calibration, "joint") | effect_variables(
-        last.adopted, last.theta, record.origins, survey, believed
-    )
-    given |= errors | slow
+    clean = cleaned(survey, calibration, last.adopted, last.theta, record.origins, undisturbed)
+    effects = effect_variables(last.adopted, last.theta, record.origins, survey, believed)
+    return common_frame(clean, calibration, "joint") | effects
+
+
+def _as_declared(survey: Survey, inquiry: Inquiry, found: Search) -> dict[str, Any]:
+    """As a user has it who looks for no effect: without what nothing that was declared explains."""
+    from magtensor.calibration.joint import calibrated
+    from magtensor.loop.fitting.refit import settled
+
+    same = len(found.last.adopted) == len(inquiry.declared)
+    alone = calibrated((found.last if same else settled(found.record, found.first, inquiry.how)).fit)
     before_fit = np.linalg.norm(survey.values("b_raw"), axis=2) - survey.values("total_field")[:, None]
-    given["residual/total_field_before"] = (("time", "sensor"), before_fit, {"units": "nT", "long_name": "|b_raw| - F"})
-    # as a user has it who looks for no effect: without what nothing that was declared explains
-    alone = calibrated((last if same else refit.settled(record, first, inquiry.how)).fit)
-    given["declared/matrix"] = (("sensor", "axis", "raw_axis"), alone.matrix, {})
-    given["declared/offset"] = (("sensor", "raw_axis"), alone.offset, {"units": "nT"})
-    given["loop/verdict"] = ((), json.dumps(outcome, default=float), {})
-    if not last.fit.keep.all():
-        doubted = np.zeros(len(survey.time), dtype=bool)
-        doubted[record.samples[refit.disturbed(record, last, how)]] = True
-        doubted = survey.made_from(doubted)
-        shifted = unread(last.adopted, survey.time)
-        bad = (doubted | shifted)[:, None]
-        given["good"] = (("time", "sensor"), survey.good_by_sensor & ~bad, {"long_name": "may be used"})
-        given["flags"] = [
+    return {
+        "residual/total_field_before": (("time", "sensor"), before_fit, {"units": "nT", "long_name": "|b_raw| - F"}),
+        "declared/matrix": (("sensor", "axis", "raw_axis"), alone.matrix, {}),
+        "declared/offset": (("sensor", "raw_axis"), alone.offset, {"units": "nT"}),
+    }
+
+
+def _flags(survey: Survey, found: Search) -> dict[str, Any]:
+    """The samples that have no part in the fit, and why."""
+    from magtensor.loop.correcting.stored import SHIFTED
+    from magtensor.loop.fitting.model import unread
+    from magtensor.loop.fitting.refit import disturbed
+
+    last, record = found.last, found.record
+    if last.fit.keep.all():
+        return {}
+    doubted = np.zeros(len(survey.time), dtype=bool)
+    doubted[record.samples[disturbed(record, last, found.how)]] = True
+    doubted = survey.made_from(doubted)
+    shifted = unread(last.adopted, survey.time)
+    usable = survey.good_by_sensor & ~(doubted | shifted)[:, None]
+    return {
+        "good": (("time", "sensor"), usable, {"long_name": "may be used"}),
+        "flags": [
             *flag_ranges(survey.time, doubted, by="close_loop", reason="no calibration and no noise explain it"),
             *flag_ranges(survey.time, shifted, by="close_loop", reason=SHIFTED),
-        ]
-    return given
+        ],
+    }
 
 
 def _or_by_directions(error: NotEnoughData, survey: Survey) -> NotEnoughData:

@@ -10,11 +10,11 @@ from __future__ import annotations
 import numpy as np
 
 from magtensor.calibration.types import Array
+from magtensor.loop.evidence.by_blocks import BLOCKS, least_t, means_of, t_of
 from magtensor.loop.fitting.model import State
 from magtensor.loop.fitting.separation import SECOND_ORDER
 
 MEANS = 8  # samples taken together: noise of a log, which is white, is not in how these follow each other
-BLOCKS = 20
 ALPHA = 0.001  # for all effects and sensors together
 ONE_VECTOR = 0.95  # of the square of what an effect adds to a sensor, and of what goes slowly there
 
@@ -25,13 +25,11 @@ def along_an_effect_words(state: State) -> list[str]:
 
     Two axes or more have to share in the vector: noise of one alone would lie along another effect's by chance.
     """
-    from scipy.special import stdtrit
-
     residual, sensors = state.residual, state.excitation.sensors
     if residual.across is None or len(residual.across) < 2 * BLOCKS * MEANS:
         return []
     seen, found = np.diagonal(residual.projector).reshape(-1, 3).mean(axis=1), (0.0, "", "")
-    surely = float(stdtrit(BLOCKS - 1, 1.0 - ALPHA / max(len(state.adopted) * len(sensors), 1)))
+    least = least_t(ALPHA / max(len(state.adopted) * len(sensors), 1))
     for model, theta in zip(state.adopted, state.theta, strict=True):
         terms = model.terms(state.excitation)
         if terms.delay is not None:
@@ -41,7 +39,7 @@ def along_an_effect_words(state: State) -> list[str]:
         )
         for number, name in enumerate(sensors):
             part = slice(3 * number, 3 * number + 3)
-            along = _along(residual.across[:, part], added[:, part], surely)
+            along = _along(residual.across[:, part], added[:, part], least)
             if along is None:
                 continue
             vector, power = along
@@ -52,9 +50,9 @@ def along_an_effect_words(state: State) -> list[str]:
     return [f"{lies}: {amount:.3g} nT rms"] if effect else []
 
 
-def _along(left: Array, added: Array, surely: float) -> tuple[Array, float] | None:
+def _along(left: Array, added: Array, least: float) -> tuple[Array, float] | None:
     """The unit vector along which an effect adds to a sensor (N, 3), and the mean square of what is left (N, 3) that
-    goes slowly along it; None where that goes along others too, or is not so many standard errors over blocks."""
+    goes slowly along it; None where that goes along others too, or its t over blocks is below the least."""
     own = added - added.mean(axis=0)
     _, size, directions = np.linalg.svd(own, full_matrices=False)
     if size[0] == 0.0 or size[0] ** 2 < ONE_VECTOR * np.sum(size**2):
@@ -66,9 +64,9 @@ def _along(left: Array, added: Array, surely: float) -> tuple[Array, float] | No
     means = left[:count].reshape(-1, MEANS, 3).mean(axis=1)
     follow = np.einsum("ni,nj->nij", means[:-1], means[1:])
     strengths = np.linalg.eigvalsh(0.5 * (follow.mean(axis=0) + follow.mean(axis=0).T))
-    each = np.array([block.mean() for block in np.array_split(vector @ follow @ vector, BLOCKS)])
+    each = means_of(vector @ follow @ vector)
     power = float(each.mean())
-    if power < surely * float(each.std(ddof=1)) / np.sqrt(BLOCKS):
+    if t_of(each) < least:
         return None
     if power < ONE_VECTOR * float(np.abs(strengths).sum()) or power < SECOND_ORDER * float(np.mean(own**2) * 3.0):
         return None

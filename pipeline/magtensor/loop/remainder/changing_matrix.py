@@ -18,6 +18,7 @@ from magtensor.error_models.acting import AXES
 from magtensor.error_models.excitation import Excitation
 from magtensor.error_models.terms import Terms, joined
 from magtensor.loop.evidence.assessment import WHITE, Colours
+from magtensor.loop.evidence.by_blocks import least_t
 from magtensor.loop.evidence.gains import Gain, interleaved_gain
 from magtensor.loop.evidence.grams import Whitened, grams_in
 from magtensor.loop.evidence.residual import Residual
@@ -137,7 +138,7 @@ def _strongest(
     of_each = shared_out(lambda number: _gains(white, x, number, waveforms), range(len(x.sensors)))
     gains = {(number, name): gain for number, own in enumerate(of_each) for name, gain in own.items()}
     each = alpha / len(gains)
-    passing = {key: gain for key, gain in gains.items() if gain.t > _least_t(each, len(gain.before))}
+    passing = {key: gain for key, gain in gains.items() if gain.t > least_t(each, len(gain.before))}
     if not passing:
         return None
     best = max(passing, key=lambda key: passing[key].total)
@@ -185,10 +186,3 @@ def _products(x: Excitation, number: int, waveform: Array) -> Terms:
 def _reference_drift(x: Excitation, waveforms: Array) -> Terms:
     """Waveforms (N, 1, K) in the reference: a base station that drifts is no change of every sensor's scale."""
     return joined([x.on_reference(w, "nT", "drift") for w in waveforms[:, 0].T])
-
-
-def _least_t(alpha: float, folds: int) -> float:
-    """Paired t over so many folds that chance exceeds with probability alpha."""
-    from scipy.special import stdtrit
-
-    return float(stdtrit(folds - 1, 1.0 - alpha))

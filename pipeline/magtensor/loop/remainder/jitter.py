@@ -9,10 +9,10 @@ from __future__ import annotations
 import numpy as np
 
 from magtensor.calibration.types import Array
+from magtensor.loop.evidence.by_blocks import BLOCKS, least_t, t_of
 from magtensor.loop.fitting.model import State
 
 ALPHA = 0.001  # for all sensors together
-BLOCKS = 20
 LEAST_PER_BLOCK = 30
 LEAST_OF_ALL = 0.01  # of the power of all that is left in it: slow noise that is far stronger turns, too
 ALIKE = 0.4  # of the power in the sensor that has most, in each other: of three, one alone makes a quarter of it
@@ -22,8 +22,6 @@ LEAST_SHARE = 0.25  # of the power of the sensor's noise: less is made by what t
 def jitter_words(state: State) -> list[str]:
     """The sensor whose stamps scatter most, by how much, and what that adds to its noise; all of them where those of
     the others scatter about as much; nothing where none do."""
-    from scipy.special import stdtrit
-
     residual, x = state.residual, state.excitation
     if residual.across is None or len(x.sensors) < 3 or len(residual.across) < BLOCKS * LEAST_PER_BLOCK or not x.turns:
         return []
@@ -32,11 +30,10 @@ def jitter_words(state: State) -> list[str]:
     slope = x.sensed(x.rate)[residual.samples][1:-1] / residual.noise.reshape(-1, 3)
     turning = np.sum(slope**2 * np.diagonal(residual.projector).reshape(-1, 3), axis=2)  # 1/s2
     found = np.array([_by_blocks(s, t) for s, t in zip(square.T, turning.T, strict=True)])  # (S, B) s2
-    mean, error = found.mean(axis=1), found.std(axis=1, ddof=1) / np.sqrt(BLOCKS)
-    t = mean / np.maximum(error, 1e-300)
+    mean, t = found.mean(axis=1), t_of(found)
     worst = int(np.argmax(mean * turning.mean(axis=0)))
     share = mean[worst] * turning[:, worst].mean() / square[:, worst].mean()
-    if t[worst] < float(stdtrit(BLOCKS - 1, 1.0 - ALPHA / len(t))) or share < LEAST_SHARE:
+    if t[worst] < least_t(ALPHA / len(t)) or share < LEAST_SHARE:
         return []
     whole = (residual.across**2).reshape(len(residual.across), -1, 3).sum(axis=2)[:, worst].mean()
     if mean[worst] * turning[:, worst].mean() < LEAST_OF_ALL * whole:

@@ -14,10 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from magtensor.calibration.types import Array
+from magtensor.loop.evidence.by_blocks import BLOCKS, least_t, t_of
 from magtensor.loop.fitting.model import State
 
 ALPHA = 0.001  # for all sensors and laws together
-BLOCKS = 20
 LEAST_PER_BLOCK = 30
 LEAST_SHARE = 0.25  # of the power of what is left of the sensor: laws of what is adopted leave less
 ALIKE = 0.4  # of the worst sensor's, in each other: of three, one alone makes a quarter of it
@@ -56,8 +56,6 @@ def with_the_field(state: State, *, stamps: bool) -> list[str]:
     ----------
     stamps: whether the rate, and a turn, are asked for.
     """
-    from scipy.special import stdtrit
-
     residual, x = state.residual, state.excitation
     if residual.across is None or len(residual.across) < BLOCKS * LEAST_PER_BLOCK:
         return []
@@ -67,7 +65,7 @@ def with_the_field(state: State, *, stamps: bool) -> list[str]:
     laws = [_Law(GAIN, "ppm", 1e6, reads[None], EVERY), _Law(GAINS, "ppm", 1e6, reads[None], EACH_AXIS)]
     laws += [_Law(STAMPS, "ms", 1e3, rate[None], EVERY)] if x.turns and stamps else []
     laws += [_Law(SWINGS, "mrad", 1e3, _turned(left, reads, noise), EVERY)] if stamps else []
-    least = float(stdtrit(BLOCKS - 1, 1.0 - ALPHA / (len(laws) * sensors)))
+    least = least_t(ALPHA / (len(laws) * sensors))
     best: tuple[float, _Law, _Found] | None = None
     for law in laws:
         found = _along(left, law)
@@ -102,10 +100,10 @@ def _along_one(left: Array, vectors: Array, weights: Array) -> tuple[float, floa
     them."""
     own, by = (_products(_soft(v)) for v in (left[None], vectors))
     each = np.array([part.sum() for part in np.array_split((own * by) @ weights, BLOCKS)])
-    t = each.mean() / max(float(each.std(ddof=1)) / np.sqrt(BLOCKS), 1e-300)
+    t = float(t_of(each))
     own, by = _products(left[None]), _products(vectors)
     part = float(np.sum((own * by) @ weights) / max(float(np.sum(by**2 @ weights)), 1e-300))
-    return float(t), part * float(np.mean(_square(vectors)) / max(float(np.mean(_square(left[None]))), 1e-300)), part
+    return t, part * float(np.mean(_square(vectors)) / max(float(np.mean(_square(left[None]))), 1e-300)), part
 
 
 def _turned(left: Array, reads: Array, noise: Array) -> Array:

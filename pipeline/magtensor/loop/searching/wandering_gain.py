@@ -10,12 +10,12 @@ import numpy as np
 
 from magtensor.calibration.types import Array
 from magtensor.error_models.terms import Terms
+from magtensor.loop.evidence.by_blocks import BLOCKS, least_t, means_of, t_of
 from magtensor.loop.fitting.model import State
 from magtensor.loop.searching.contribution import happens_once
 from magtensor.loop.searching.course_of_time import is_a_course
 
 MEANS = 8  # samples taken together
-BLOCKS = 20
 ALPHA = 0.001  # of one sensor
 A_GAIN = 0.7  # of what an effect adds to a sensor, along what it reads: of the gain of one axis three quarters
 AN_OFFSET = 0.95  # the same of what adds to the axes too, of which an offset is across the field at other attitudes
@@ -48,8 +48,6 @@ def of_a_wandering_gain(state: State, fixed: int) -> tuple[list[int], str] | Non
 
 def _of_its_gain(state: State, sensor: int) -> float:
     """nT rms of what is left of a sensor slowly along what it reads; 0 where noise may have made it."""
-    from scipy.special import stdtrit
-
     residual, x = state.residual, state.excitation
     assert residual.across is not None
     noise = residual.noise.reshape(-1, 3)[sensor]
@@ -57,9 +55,8 @@ def _of_its_gain(state: State, sensor: int) -> float:
     length = np.linalg.norm(reads, axis=1)
     left = np.sum(residual.across.reshape(len(reads), -1, 3)[:, sensor] * reads, axis=1) / length
     means = left[: len(left) // MEANS * MEANS].reshape(-1, MEANS).mean(axis=1)
-    each = np.array([block.mean() for block in np.array_split(means[:-1] * means[1:], BLOCKS)])
-    surely = float(stdtrit(BLOCKS - 1, 1.0 - ALPHA))
-    if each.mean() < surely * float(each.std(ddof=1)) / np.sqrt(BLOCKS):
+    each = means_of(means[:-1] * means[1:])
+    if t_of(each) < least_t(ALPHA):
         return 0.0
     seen = float(np.diagonal(residual.projector).reshape(-1, 3).mean(axis=1)[sensor])
     one = np.mean(np.sum((reads * noise) ** 2, axis=1)) / np.mean(length**2)  # nT2 of a unit along what it reads
