@@ -182,6 +182,40 @@ def apply_and_refine(
         The survey, and the calibration in its new frame: None where no turn was asked for or is significant. The
         attribute `rotation_refined` of `calibrated/b` says what was done.
     """
+    from magtensor.tensor.elements import five
+    from magtensor.tensors import refined, refinement_noise, stored_refinement
+
+    survey = load_as(planned, path, tolerant=tolerant, rows=rows)
+    if "calibration/matrix" in calibration:
+        return _with_sensors_calibrated(
+            calibration, survey, planned, str(path),
+            refine_rotation=refine_rotation, whole=rows is None, uniform=uniform, judge=judge, date=date,
+            scatter=scatter,
+        )  # fmt: skip
+    source = str(calibration.attributes.get("source", ""))
+    if refine_rotation:
+        raise DataError("it calibrates no sensors, so there is no common frame to refine", where=source)
+    refinement = stored_refinement(calibration)
+    if refinement is None:
+        raise DataError("it holds no calibration", where=source, hint="name a calibration.nc or result.nc")
+    measured = five(survey.values("calibrated/tensor"))
+    return survey.merged(refined(measured, refinement_noise(calibration), refinement)), None
+
+
+def _with_sensors_calibrated(
+    calibration: Survey,
+    survey: Survey,
+    planned: Plan,
+    path: str,
+    *,
+    refine_rotation: bool,
+    whole: bool,
+    uniform: bool,
+    judge: bool,
+    date: datetime | None,
+    scatter: float | None,
+) -> tuple[Survey, Tied | None]:
+    """The same of a survey that is loaded, with a calibration of sensors; `whole`: no rows were chosen."""
     from magtensor.calibrated import corrected, require_positions, require_sensors, restored
     from magtensor.calibration.surveys.corrections import with_scatter
     from magtensor.dated import at_date_of
@@ -202,86 +236,62 @@ def apply_and_refine(
     from magtensor.offsets_apart import scatter_for, without_scatter
     from magtensor.platform_frame import as_fitted, with_refined_rotation
     from magtensor.standing_out import before_and_cleaned, flagged
-    from magtensor.tensor.elements import five
-    from magtensor.tensors import (
-        assembled,
-        noise_of_a_sample,
-        refined,
-        refinement_noise,
-        stored_assembly,
-        stored_refinement,
-    )
+    from magtensor.tensors import assembled, noise_of_a_sample, stored_assembly, stored_refinement
+
+    require_sensors(survey, result.sensors_of(calibration), path)
+    if "calibration/position" in calibration:
+        require_positions(survey, calibration.values("calibration/position"), path)
+    fitted, dated = at_date_of(survey, calibration, restored(calibration), date)
+    apart = scatter_for(survey, calibration) if scatter is None else scatter
+    fitted = with_scatter(fitted, apart)
+    sensed = as_fitted(calibration, fitted)
+
+    adopted, theta, origins = stored_effects(calibration, planned.registry)
+    adopted = on_its_clock(adopted, theta, origins, calibration, sensed, survey)
+    here = those_here(adopted, theta, origins, sensed, survey, calibration)
+    adopted, theta = here.adopted, here.theta
+    known = calibration.values("calibration/noise_std") if "calibration/noise_std" in calibration else None
+    clean = partial(cleaned, calibration=sensed, adopted=adopted, theta=theta, origins=origins)
+    judged = partial(flagged, calibration=fitted, noise=known, uniform=uniform)
+    before, survey = before_and_cleaned(survey, clean, judged) if judge and adopted else (survey, clean(survey))
+    if whole:
+        survey = without_unread(survey, adopted)
+    if judge:
+        survey = judged(survey)
+
+    words = {
+        "not_taken_off": here.left_in,
+        "extrapolated": "; ".join(f"{name}: {how}" for name, how in here.beyond.items()),
+        "bridged": bridged(before, adopted),
+        "begins_anew": begun_anew(adopted, calibration),
+        "not_as_dated": not_as_dated(adopted, survey),
+        "held": held(adopted, survey),
+        "in_equilibrium": in_equilibrium(adopted, survey),
+        "not_on_this_survey": here.refuted,
+    }
+    if whole and (as_read := _better_as_read(before, survey, fitted, adopted)) is not None:
+        survey = as_read
+        words["total_field_as_read"] = ", ".join(a.name for a in adopted if a.component.effect == "reference")
+    given = corrected(fitted, survey, **words)
+    doubts: dict[str, str] = {}
+    if whole and judge:
+        doubts = _disagreeing(np.asarray(given["calibrated/b"][1]), survey)
+        doubts["contradicted"] = contradicted_here(before, survey, sensed, adopted, theta, origins)
+    survey = survey.merged(_named(given, calibration, dated, apart, doubts))
 
     turned: Tied | None = None
-    survey = load_as(planned, path, tolerant=tolerant, rows=rows)
-    refinement = stored_refinement(calibration)
-    if "calibration/matrix" in calibration:
-        require_sensors(survey, result.sensors_of(calibration), str(path))
-        if "calibration/position" in calibration:
-            require_positions(survey, calibration.values("calibration/position"), str(path))
-        fitted, dated = at_date_of(survey, calibration, restored(calibration), date)
-        apart = scatter_for(survey, calibration) if scatter is None else scatter
-        fitted = with_scatter(fitted, apart)
-        adopted, theta, origins = stored_effects(calibration, planned.registry)
-        adopted = on_its_clock(adopted, theta, origins, calibration, as_fitted(calibration, fitted), survey)
-        here = those_here(adopted, theta, origins, as_fitted(calibration, fitted), survey, calibration)
-        adopted, theta = here.adopted, here.theta
-        known = calibration.values("calibration/noise_std") if "calibration/noise_std" in calibration else None
-        sensed = as_fitted(calibration, fitted)
-        clean = partial(cleaned, calibration=sensed, adopted=adopted, theta=theta, origins=origins)
-        judged = partial(flagged, calibration=fitted, noise=known, uniform=uniform)
-        before, survey = before_and_cleaned(survey, clean, judged) if judge and adopted else (survey, clean(survey))
-        if rows is None:
-            survey = without_unread(survey, adopted)
-        if judge:
-            survey = judged(survey)
-        words = {
-            "not_taken_off": here.left_in,
-            "extrapolated": "; ".join(f"{name}: {how}" for name, how in here.beyond.items()),
-            "bridged": bridged(before, adopted),
-            "begins_anew": begun_anew(adopted, calibration),
-            "not_as_dated": not_as_dated(adopted, survey),
-            "held": held(adopted, survey),
-            "in_equilibrium": in_equilibrium(adopted, survey),
-            "not_on_this_survey": here.refuted,
-        }
-        given = corrected(fitted, survey, **words)
-        if rows is None and (as_read := _better_as_read(before, survey, fitted, adopted)) is not None:
-            survey = as_read
-            names = ", ".join(a.name for a in adopted if a.component.effect == "reference")
-            given = corrected(fitted, survey, **words, total_field_as_read=names)
-        doubts: dict[str, str] = {}
-        if rows is None and judge:
-            doubts = _disagreeing(np.asarray(given["calibrated/b"][1]), survey)
-            doubts["contradicted"] = contradicted_here(
-                before, survey, as_fitted(calibration, fitted), adopted, theta, origins
-            )
-        survey = survey.merged(_named(given, calibration, dated, apart, doubts))
-        if refine_rotation:
-            survey, turned = with_refined_rotation(survey, calibration, fitted)
-            if turned is not None:  # as it is kept, it holds the scatter beside the covariance
-                fitted = turned.calibration
-                turned = replace(turned, calibration=without_scatter(fitted, apart))
-        if "calibration/tensor_gain" in calibration:
-            b = survey.values("calibrated/b")
-            noise = noise_of_a_sample(calibration, calibration.values("calibration/noise_std"))
-            position = calibration.values("calibration/position")
-            assembly = stored_assembly(calibration)
-            off = taken_off(calibration, fitted, before, survey, adopted, theta, origins)
-            survey = survey.merged(assembled(assembly, b, position, noise, fitted, refinement, off))
-    elif refine_rotation:
-        raise DataError(
-            "it calibrates no sensors, so there is no common frame to refine",
-            where=str(calibration.attributes.get("source", "")),
-        )
-    elif refinement is not None:
-        measured = five(survey.values("calibrated/tensor"))
-        survey = survey.merged(refined(measured, refinement_noise(calibration), refinement))
-    else:
-        raise DataError(
-            "it holds no calibration", where=str(calibration.attributes.get("source", "")),
-            hint="name a calibration.nc or result.nc",
-        )  # fmt: skip
+    if refine_rotation:
+        survey, turned = with_refined_rotation(survey, calibration, fitted)
+        if turned is not None:  # as it is kept, it holds the scatter beside the covariance
+            fitted = turned.calibration
+            turned = replace(turned, calibration=without_scatter(fitted, apart))
+    if "calibration/tensor_gain" in calibration:
+        b = survey.values("calibrated/b")
+        noise = noise_of_a_sample(calibration, calibration.values("calibration/noise_std"))
+        position = calibration.values("calibration/position")
+        off = taken_off(calibration, fitted, before, survey, adopted, theta, origins)
+        refinement = stored_refinement(calibration)
+        survey = survey.merged(assembled(stored_assembly(calibration), b, position, noise, fitted, refinement, off))
     return survey, turned
 
 
