@@ -87,6 +87,11 @@ class Rounds:
                 found = [c for c in found if c is not same] + [two]
         return sorted(found, key=lambda c: -c.assessment.gain.total)
 
+    def tell(self, line: str) -> None:
+        """A line about the round, to whoever listens."""
+        if self.say is not None:
+            self.say(line)
+
     def open_models(self, state: State) -> list[Component]:
         """The models that have what they need and are not in already, or can be in more than once."""
         taken = {a.name for a in state.adopted}
@@ -98,72 +103,19 @@ class Rounds:
 
     def run(self, record: Record, state: State, how: Fitting) -> Ended:
         """Adopt the best, refit, repeat, until nothing is left that the data want."""
-        shared: Sought | None = None
-        standing = trial(record, state, how)
-        steps: list[Step] = []
-        asked = False  # whether something simpler does as well
+        going = _Progress(self, record, state, how, trial(record, state, how))
         for _ in range(self.most_effects + 2):
-            state = with_lines(state, record, self.lines)
-            if len(state.adopted) - self.fixed >= self.most_effects or state.residual.square() < ROUNDING:
+            if going.ends():
                 break
-            candidates = self.candidates(state, record, how)
-            open_ = len(testable(state.excitation, self.models))
-            adopted = self.first_kept(record, standing, candidates, how, open_)
-            step = adopted.step(state, candidates)
-            steps.append(replace(step, screened=tuple(m.name for m in self.open_models(state))))
-            steps.extend(adopted.then)
-            if adopted.standing is not None:
-                record, state = renewed(record, adopted.standing.state, how)
-                places = range(self.fixed, len(state.adopted))
-                standing = on_more_sensors(record, replace(adopted.standing, state=state), how, places[:-1])
-                standing, gone = in_the_place_of_others(record, standing, how, places)
-                state = standing.state
-                if gone:
-                    steps[-1] = replace(steps[-1], dropped=(*steps[-1].dropped, *gone))
-                if by_a_curve(state.adopted[-1]):  # of more pieces, before anything is adopted for what it leaves
-                    standing, more = by_any_law(
-                        record, standing, how, [len(state.adopted) - 1], self.alpha, open_, self.fixed
-                    )
-                    state, steps = standing.state, [*steps, *more]
-                continue
-            instead = None if asked else exchanged(record, state, steps, how, self.fixed, open_)
-            if instead is None and not asked:
-                instead = with_another_lag(record, state, how, self.fixed, open_, self.alpha)
-            asked = True
-            if instead is not None:
-                after, step = instead
-                if self.say is not None and step.adopted is not None:
-                    self.say(f"{step.adopted.model.name} takes the place of {', '.join(step.refused)}")
-                steps[-1] = step
-                record, state = renewed(record, after.state, how)
-                standing = replace(after, state=state)
-                continue
-            places = range(self.fixed, len(state.adopted))
-            standing, more = by_any_law(record, standing, how, places, self.alpha, open_, self.fixed)
-            if more:
-                if self.say is not None:
-                    self.say("following any curve of a channel")
-                record, state = renewed(record, standing.state, how)
-                standing, steps = replace(standing, state=state), [*steps, *more]
-                continue
-            shared = sought(state, record)
-            kept = self.by_its_channel(record, standing, shared, how, open_)
-            if kept.standing is None and (ends := at_an_end(settled(record, state, how))):
-                curves = [c for channel in ends for c in self.curves_of(channel, state)]
-                kept = self.first_kept(record, standing, curves, how, open_, with_others=False)
-            if kept.standing is None and by_what_they_read(state).any():
-                kept = self.first_kept(record, standing, self.curves_of(OUTPUTS, state), how, open_, with_others=False)
-            if kept.standing is not None:
-                steps.append(kept.step(state, [kept.chosen] if kept.chosen else []))
-                record, state = renewed(record, kept.standing.state, how)
-                shared, standing = None, replace(kept.standing, state=state)
-                continue
-            shared, found = self.with_source(record, state, how, steps[-1], shared)
-            if found is None:
+            if not (
+                going.adopts_the_best()
+                or going.exchanges()
+                or going.bends_what_is_adopted()
+                or going.adopts_a_curve()
+                or going.adopts_a_source()
+            ):
                 break
-            record, state, steps[-1] = found
-            shared, standing = None, trial(record, state, how)
-        return Ended(record, state, how, tuple(steps), shared)
+        return Ended(going.record, going.state, how, tuple(going.steps), going.shared)
 
     def first_kept(
         self,
@@ -201,8 +153,7 @@ class Rounds:
             chosen, rivals, channels = proposal.chosen, proposal.rivals, proposal.channels
             if (fits := fits + 1) > (most_fits or fits):
                 break
-            if self.say is not None:
-                self.say(f"adopting {chosen.model.name}")
+            self.tell(f"adopting {chosen.model.name}")
             tried, dropped = self.eliminated(record, before, chosen, fitted(record, before, chosen, how), how)
             if (tried.hurt or tried.why == UNEARNED) and with_others:
                 with_others = False  # a search beside it takes as long as a round
@@ -317,8 +268,7 @@ class Rounds:
             source = source_instead(hidden, record, state, shared, how, self.fixed, self.alpha)
         if source is None:
             return shared, None
-        if self.say is not None:
-            self.say(f"adopting {NAME}")
+        self.tell(f"adopting {NAME}")
         record, state = source.record, source.after
         last, dropped = eliminate(record, state, how, self.fixed)
         if parts := [i for i in range(self.fixed, len(last.adopted)) if part_of_the_source(last, i)]:
@@ -328,6 +278,130 @@ class Rounds:
             record, state = renewed(record, last, how)
         gone = (*([instead] if instead else []), *(() if NAME in dropped else dropped))
         return None, (record, state, replace(step, adopted=source.evidence, dropped=gone, like=source.like))
+
+
+@dataclass
+class _Progress:
+    """How far the rounds of a search have come; each method says whether something was adopted, or changed.
+
+    Attributes:
+        rounds: the search; record: the samples; state: the fit, which knows the lines in what it leaves; how: it is
+            made; standing: how it does on held-out blocks.
+        steps: the rounds so far; shared: the waveform that the sensors share beside all that was adopted.
+        asked: whether something simpler was looked for in the place of what was adopted; open_: how many models the
+            round looks at.
+    """
+
+    rounds: Rounds
+    record: Record
+    state: State
+    how: Fitting
+    standing: Trial
+    steps: list[Step] = field(default_factory=list)
+    shared: Sought | None = None
+    asked: bool = False
+    open_: int = 0
+
+    def ends(self) -> bool:
+        """Whether nothing more may be adopted, or nothing is left."""
+        rounds = self.rounds
+        self.state = with_lines(self.state, self.record, rounds.lines)
+        self.open_ = len(testable(self.state.excitation, rounds.models))
+        full = len(self.state.adopted) - rounds.fixed >= rounds.most_effects
+        return full or self.state.residual.square() < ROUNDING
+
+    def adopts_the_best(self) -> bool:
+        """Of all candidates."""
+        rounds, before = self.rounds, self.state
+        candidates = rounds.candidates(before, self.record, self.how)
+        kept = rounds.first_kept(self.record, self.standing, candidates, self.how, self.open_)
+        step = kept.step(before, candidates)
+        self.steps += [replace(step, screened=tuple(m.name for m in rounds.open_models(before))), *kept.then]
+        if kept.standing is None:
+            return False
+        self._stands(kept.standing)
+        places = self._adopted
+        more = on_more_sensors(self.record, self.standing, self.how, places[:-1])
+        self.standing, gone = in_the_place_of_others(self.record, more, self.how, places)
+        self.state = self.standing.state
+        if gone:
+            self.steps[-1] = replace(self.steps[-1], dropped=(*self.steps[-1].dropped, *gone))
+        if by_a_curve(self.state.adopted[-1]):  # of more pieces, before anything is adopted for what it leaves
+            self._bends([len(self.state.adopted) - 1])
+        return True
+
+    def exchanges(self) -> bool:
+        """What does as well, or another lag, in the place of what was adopted; asked once."""
+        if self.asked:
+            return False
+        self.asked = True
+        rounds, record, how = self.rounds, self.record, self.how
+        instead = exchanged(record, self.state, self.steps, how, rounds.fixed, self.open_)
+        if instead is None:
+            instead = with_another_lag(record, self.state, how, rounds.fixed, self.open_, rounds.alpha)
+        if instead is None:
+            return False
+        after, step = instead
+        if step.adopted is not None:
+            rounds.tell(f"{step.adopted.model.name} takes the place of {', '.join(step.refused)}")
+        self.steps[-1] = step
+        self._stands(after)
+        return True
+
+    def bends_what_is_adopted(self) -> bool:
+        """Any curve of the channel that an adopted model follows, in its place."""
+        if not self._bends(self._adopted):
+            return False
+        self.rounds.tell("following any curve of a channel")
+        self._stands(self.standing)
+        return True
+
+    def adopts_a_curve(self) -> bool:
+        """Curves of the channel that the shared waveform goes with, of those at an end of their range where samples fit
+        nothing, or of what an axis reads."""
+        rounds, record, state, how = self.rounds, self.record, self.state, self.how
+        self.shared = sought(state, record)
+        kept = rounds.by_its_channel(record, self.standing, self.shared, how, self.open_)
+        if kept.standing is None and (ends := at_an_end(settled(record, state, how))):
+            curves = [c for channel in ends for c in rounds.curves_of(channel, state)]
+            kept = rounds.first_kept(record, self.standing, curves, how, self.open_, with_others=False)
+        if kept.standing is None and by_what_they_read(state).any():
+            curves = rounds.curves_of(OUTPUTS, state)
+            kept = rounds.first_kept(record, self.standing, curves, how, self.open_, with_others=False)
+        if kept.standing is None:
+            return False
+        self.steps.append(kept.step(state, [kept.chosen] if kept.chosen else []))
+        self._stands(kept.standing)
+        self.shared = None
+        return True
+
+    def adopts_a_source(self) -> bool:
+        """One that nobody logged."""
+        self.shared, found = self.rounds.with_source(self.record, self.state, self.how, self.steps[-1], self.shared)
+        if found is None:
+            return False
+        self.record, self.state, self.steps[-1] = found
+        self.shared, self.standing = None, trial(self.record, self.state, self.how)
+        return True
+
+    @property
+    def _adopted(self) -> range:
+        """The places of what the search has adopted."""
+        return range(self.rounds.fixed, len(self.state.adopted))
+
+    def _stands(self, standing: Trial) -> None:
+        """From here on."""
+        self.record, self.state = renewed(self.record, standing.state, self.how)
+        self.standing = replace(standing, state=self.state)
+
+    def _bends(self, places: Sequence[int]) -> bool:
+        """Whether some of the models follow other curves now."""
+        alpha, fixed = self.rounds.alpha, self.rounds.fixed
+        self.standing, more = by_any_law(self.record, self.standing, self.how, places, alpha, self.open_, fixed)
+        if more:
+            self.state = self.standing.state
+            self.steps += more
+        return bool(more)
 
 
 def testable(x: Excitation, models: Sequence[Component]) -> list[Component]:
