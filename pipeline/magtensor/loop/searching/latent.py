@@ -9,6 +9,7 @@ stretches. Two sensors have one contrast: which of them was disturbed cannot be 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -142,25 +143,9 @@ def sought(state: State, record: Record, *, may_follow: bool = False) -> Sought 
     inside = lowest(z, test.band)
     gain = predicted(inside, z - inside, basis, groups)
     like = followed(time, values, record)
-    objection = left_by = ""
-    if not told:
-        objection = "with two sensors it cannot be told from a disturbance of one of them"
-    elif n * float(seen @ seen) <= OF_THE_LAW * explained_before(state, between=True):
-        objection = LEFT_BY_LAWS
-    elif (unseen := of_an_unseen_path(state)) and n * float(seen @ seen) <= explained_by(state, unseen):
-        name = state.adopted[unseen[0]].name
-        objection = f"it is less than {name} explains, which remembers the field on the way between the samples"
-    elif with_the_turn_before(state.excitation, residual.samples, values):
-        objection = "it goes with how far the field turned since the sample before, as what is quicker would make it"
-    elif not gain.consistent:
-        objection = "the sensors do not predict each other with it on held-out stretches"
-    elif like is not None and not may_follow:
-        objection = f"{OF_A_CHANNEL} {like.words}"
-    elif left_by := effect_along(state, basis, seen):
-        objection = f"the sensors feel it as they feel {left_by}, which may leave it"
-    elif _acts_once(values):
-        objection = SINGLE_STRETCH
-    elif second_factor(test, basis, factors) > SECOND:
+    against = _against(state, basis, seen, values, gain, None if may_follow else like, told=told)
+    objection, left_by = next(against, ("", ""))
+    if not objection and second_factor(test, basis, factors) > SECOND:
         objection = "one waveform does not explain what the sensors share"
     return Sought(
         time=time,
@@ -177,6 +162,37 @@ def sought(state: State, record: Record, *, may_follow: bool = False) -> Sought 
         objection=objection,
         left_by=left_by,
     )
+
+
+def _against(
+    state: State, basis: Array, seen: Array, values: Array, gain: Gain, like: Likeness | None, *, told: bool
+) -> Iterator[tuple[str, str]]:
+    """What speaks against a source of this waveform (N,), the first above all, and the adopted effect that may leave
+    it.
+
+    Parameters
+    ----------
+    seen: (m,) how the sensors feel it, in the directions (3 S, m) of the basis.
+    like: the logged channel that it may not follow; told: whether it is told from a disturbance of one sensor.
+    """
+    power = len(values) * float(seen @ seen)
+    if not told:
+        yield "with two sensors it cannot be told from a disturbance of one of them", ""
+    if power <= OF_THE_LAW * explained_before(state, between=True):
+        yield LEFT_BY_LAWS, ""
+    if (unseen := of_an_unseen_path(state)) and power <= explained_by(state, unseen):
+        name = state.adopted[unseen[0]].name
+        yield f"it is less than {name} explains, which remembers the field on the way between the samples", ""
+    if with_the_turn_before(state.excitation, state.residual.samples, values):
+        yield "it goes with how far the field turned since the sample before, as what is quicker would make it", ""
+    if not gain.consistent:
+        yield "the sensors do not predict each other with it on held-out stretches", ""
+    if like is not None:
+        yield f"{OF_A_CHANNEL} {like.words}", ""
+    if left_by := effect_along(state, basis, seen):
+        yield f"the sensors feel it as they feel {left_by}, which may leave it", left_by
+    if _acts_once(values):
+        yield SINGLE_STRETCH, ""
 
 
 def _acts_once(values: Array) -> bool:

@@ -96,29 +96,34 @@ def search(
     not_tested = _not_tested(last.excitation, models)
     found = Search(first, last, steps, not_tested, rounds.failed, record, shared, how, evenly)
     while doubted := overshadowed(found, len(declared)):
-        places, why = doubted
-        name = found.last.adopted[places[0]].name
-        bare = replace(record, waveform=None) if name == NAME else record
-        rest = possible_without(bare, found.last, places, how)
+        rest = _taken_out(found, rounds, *doubted)
         if rest is None:
             break
-        if say is not None:
-            say(f"taking {name} out again")
-        record, state = renewed(bare, rest, how)
-        state, steps = _weighed_once_more(record, state, steps, how, len(declared))
-        state, dropped = borne_out(record, state, how, len(declared))
-        candidates = rounds.candidates(state := with_lines(state, record, lines), record, how)
-        step = Step(state, tuple(candidates), None, refused={name: why}, dropped=dropped)
-        source = None if name == NAME else rounds.with_source(record, state, how, step, sought(state, record))[1]
-        if source is not None:  # which the model that is gone was a part of
-            record, state, step = source
-        steps, last = (*steps, step), settled(record, state, how)
-        not_tested = _not_tested(last.excitation, models)
-        found = replace(
-            found, last=last, steps=steps, not_tested=not_tested, record=record, shared=sought(last, record),
-            evenly=unweighed(record, last, how),
-        )  # fmt: skip
+        found = rest
     return found
+
+
+def _taken_out(found: Search, rounds: Rounds, places: Sequence[int], why: str) -> Search | None:
+    """The search without the models at some places, for a reason; None where no fit without them is possible."""
+    how, fixed, name = found.how, rounds.fixed, found.last.adopted[places[0]].name
+    bare = replace(found.record, waveform=None) if name == NAME else found.record
+    rest = possible_without(bare, found.last, places, how)
+    if rest is None:
+        return None
+    rounds.tell(f"taking {name} out again")
+    record, state = renewed(bare, rest, how)
+    state, steps = _weighed_once_more(record, state, found.steps, how, fixed)
+    state, dropped = borne_out(record, state, how, fixed)
+    state = with_lines(state, record, rounds.lines)
+    step = Step(state, tuple(rounds.candidates(state, record, how)), None, refused={name: why}, dropped=dropped)
+    source = None if name == NAME else rounds.with_source(record, state, how, step, sought(state, record))[1]
+    if source is not None:  # which the model that is gone was a part of
+        record, state, step = source
+    last = settled(record, state, how)
+    return replace(
+        found, last=last, steps=(*steps, step), not_tested=_not_tested(last.excitation, rounds.models), record=record,
+        shared=sought(last, record), evenly=unweighed(record, last, how),
+    )  # fmt: skip
 
 
 def _without_what_is_loud(ended: Ended, rounds: Rounds) -> Ended:
