@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -157,10 +158,22 @@ def test_events_within_the_noise_of_one_loud_sensor_are_not_told_of(seed: int, t
 def test_a_sensor_that_is_far_louder_than_the_others_is_told(times: float, told: bool) -> None:
     added = np.zeros((1200, 4, 3))
     added[:, 2] = np.sqrt(times**2 - 1.0) * np.random.default_rng(33).standard_normal((1200, 3))
-    words = louder_words(linear_state(synthetic(3, added=added)))
+    record = synthetic(3, added=added)
+    words = louder_words(linear_state(record), record)
     assert bool(words) is told
     if told:
         said = re.fullmatch(r"the noise of most sensors is ([\d.]+) nT an axis, that of S3 is ([\d.]+) nT", words[0])
         assert (
             said and float(said[1]) == pytest.approx(1.0, abs=0.05) and float(said[2]) == pytest.approx(4.0, rel=0.05)
         )
+
+
+@pytest.mark.parametrize("step_nT", [2.0, 2.0**1.5])
+def test_a_sensor_that_is_rounded_more_coarsely_than_the_others_is_told_with_its_steps(step_nT: float) -> None:
+    record = synthetic(3, noise_nT=0.1)
+    raw = record.raw.copy()
+    raw[:, 2] = step_nT * np.round(raw[:, 2] / step_nT)
+    record = replace(record, raw=raw)
+    (words,) = louder_words(linear_state(record), record)
+    assert words.endswith(f"nT, for its outputs come in steps of {step_nT:.3g} nT")
+    assert float(words.split("that of S3 is ")[1].split()[0]) == pytest.approx(step_nT / 12**0.5, rel=0.05)

@@ -266,13 +266,15 @@ def _fit(
     return fit if np.array_equal(more, fit.keep) else fitted(more)
 
 
-def rounding(record: Record, state: State) -> float:
-    """nT, the steps that the outputs come in, where rounding makes most of their noise; 0 elsewhere."""
+def rounding(record: Record, state: State, sensor: int | None = None) -> float:
+    """nT, the steps that the outputs come in, or those of one sensor, where rounding makes most of their noise; 0
+    elsewhere."""
     from magtensor.survey.recorded_numbers import resolution
 
-    outputs = record.raw.reshape(len(record.raw), -1)
+    asked = slice(None) if sensor is None else slice(3 * sensor, 3 * sensor + 3)
+    outputs, noise = record.raw.reshape(len(record.raw), -1)[:, asked], state.residual.noise[asked]
     step = float(np.median([resolution(output, repeats=0.0) for output in outputs.T]))
-    return step if step**2 / 12.0 > MOST_OF_THE_NOISE * float(np.median(state.residual.noise)) ** 2 else 0.0
+    return step if step**2 / 12.0 > MOST_OF_THE_NOISE * float(np.median(noise)) ** 2 else 0.0
 
 
 def loud_stretches(record: Record, state: State, how: Fitting) -> tuple[tuple[float, float], ...]:

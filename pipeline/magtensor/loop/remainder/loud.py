@@ -91,13 +91,16 @@ def _stretch_words(longest: dict[str, tuple[float, float, float, int]], sensors:
     ]
 
 
-def louder_words(state: State) -> list[str]:
-    """Which sensors are far louder than most: what no model of a search would ever follow, a converter that lost a bit,
-    passes for the noise of its sensor."""
+def louder_words(state: State, record: Record) -> list[str]:
+    """Which sensors are far louder than most, and whether rounding makes it: what no model of a search would ever
+    follow, a converter that lost a bit, passes for the noise of its sensor."""
     noise = np.sqrt(np.mean(state.residual.noise.reshape(-1, 3) ** 2, axis=1))
-    usual = float(np.median(noise))
-    each = zip(state.excitation.sensors, noise, strict=True)
-    louder = [f"that of {name} is {own:.3g} nT" for name, own in each if own > FAR_LOUDER * usual]
+    usual, louder = float(np.median(noise)), list[str]()
+    for number, name in enumerate(state.excitation.sensors):
+        if noise[number] > FAR_LOUDER * usual:
+            step = rounding(record, state, number)
+            why = f", for its outputs come in steps of {step:.3g} nT" if step else ""
+            louder.append(f"that of {name} is {noise[number]:.3g} nT{why}")
     return [f"the noise of most sensors is {usual:.3g} nT an axis, {' and '.join(louder)}"] if louder else []
 
 

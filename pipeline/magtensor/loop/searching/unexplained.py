@@ -89,7 +89,7 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
         )
     elif band is not None:
         excess = max(excess**2 + state.residual.scale**2 - band.rms_nT**2, 0.0) ** 0.5
-    beside = [*loud.words, *louder_words(state), *unread_words(state, record)]
+    beside = [*loud.words, *louder_words(state, record), *unread_words(state, record)]
     if excess < state.residual.scale and words == _left_by_a_law(found, record):
         words, beside = [], [*words, *beside]
     gradient = gradient_share(state, record.position)
