@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from loop_cases import synthetic
 
+from magtensor.loop.fitting.model import Fitting, Record
 from magtensor.loop.remainder.flagged import before_the_memory
+from magtensor.loop.searching.search import search
+from magtensor.registry import Registry
 
 HALF_WIDTH_NT = 5000.0
 
@@ -52,3 +57,35 @@ def test_a_bad_beginning_is_of_the_filter_until_it_has_died_away(count: int, kno
     found, words = before_the_memory(np.arange(100) < count, state(creeps))
     assert found.sum() == (count if known_why else 0)
     assert bool(words) is known_why and (not known_why or "the state that bandwidth began with" in words)
+
+
+def postures_with_a_play(seed: int, each: int = 12, count: int = 130) -> Record:
+    """A play of 8000 nT in the x axis of each sensor, which begins far from what the first posture would make of it."""
+    rng = np.random.default_rng(seed)
+    still = synthetic(seed, count, noise_nT=0.0)
+    assert still.total_field is not None and still.quiet_field is not None
+    driver = still.raw[:, :, 0]
+    play, state = np.zeros_like(driver), np.zeros(4)
+    for k, now in enumerate(driver):
+        play[k] = state = np.clip(state, now - 8000.0, now + 8000.0)
+    vectors = rng.standard_normal((4, 3)) / 2500.0
+    raw = np.repeat(still.raw + (play - driver)[:, :, None] * vectors, each, axis=0)
+    samples, total = each * count, np.repeat(still.total_field, each)
+    return replace(
+        still,
+        time=np.arange(samples, dtype=float),
+        raw=raw + 0.15 * rng.standard_normal(raw.shape),
+        total_field=total,
+        quiet_field=total,
+        run=np.zeros(samples, dtype=int),
+        segment=np.zeros(samples, dtype=int),
+        samples=np.arange(samples),
+    )
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_what_a_play_began_with_is_no_source_that_all_sensors_share(seed: int) -> None:
+    models = [Registry.load().find("error_model", name) for name in ("hysteresis", "latent_source")]
+    found = search(postures_with_a_play(seed), models, Fitting())
+    assert [a.name for a in found.last.adopted] == ["hysteresis"]
+    assert found.shared is None or not (found.shared.significant and not found.shared.objection)

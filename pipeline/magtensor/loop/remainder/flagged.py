@@ -56,7 +56,8 @@ def before_the_memory(bad: Mask, state: State) -> tuple[Mask, str]:
     shows, which nobody knows, and this in words; none, and "", otherwise."""
     x, none = state.excitation, np.zeros(len(bad), dtype=bool)
     end = int(np.argmin(bad)) if not bad.all() else len(bad)
-    name = next((model.name for model in state.adopted if end and _remembers(model, end, x)), "")
+    last = max(end - LONGEST_SPIKE, 0)
+    name = next((model.name for model in state.adopted if end and last < forgotten_at(model, x)), "")
     if not name:
         return none, ""
     return np.arange(len(bad)) < end, (
@@ -65,16 +66,19 @@ def before_the_memory(bad: Mask, state: State) -> tuple[Mask, str]:
     )
 
 
-def _remembers(model: Adopted, end: int, x: Excitation) -> bool:
-    """Whether what a model had seen before the survey may still show just before a sample."""
-    last = max(end - LONGEST_SPIKE, 0)
+def forgotten_at(model: Adopted, x: Excitation) -> int:
+    """The number of the first sample in which nothing shows any more of what a model had seen before the survey: 0 of
+    one without a memory, or whose beginning is fitted; that of all samples where it always may."""
     if model.name == HYSTERESIS:
         own = [i for i, name in enumerate(x.sensors) if name in (model.sensors or x.sensors)]
-        output = x.output[: last + 1, own].reshape(last + 1, -1)
-        return bool((np.ptp(output, axis=0) < 2.0 * float(model.settings["half_width_nT"])).any())
-    if model.name not in FILTERS:
-        return False
-    return bool(x.elapsed[last] <= DIED_AWAY * float(model.settings["tau_s"]))
+        output = x.output[:, own].reshape(len(x.output), -1)
+        swept = np.maximum.accumulate(output) - np.minimum.accumulate(output)
+        shows = (swept < 2.0 * float(model.settings["half_width_nT"])).any(axis=1)
+    elif model.name in FILTERS:
+        shows = x.elapsed <= DIED_AWAY * float(model.settings["tau_s"])
+    else:
+        return 0
+    return int(np.count_nonzero(shows))
 
 
 def unread_words(state: State, record: Record) -> list[str]:

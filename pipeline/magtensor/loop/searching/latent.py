@@ -41,6 +41,7 @@ from magtensor.loop.fitting.log_noise import brought_in
 from magtensor.loop.fitting.model import Adopted, Fitting, Record, State, generic
 from magtensor.loop.fitting.refit import joint_state
 from magtensor.loop.fitting.trial import per_sample
+from magtensor.loop.remainder.flagged import forgotten_at
 from magtensor.loop.searching.contribution import happens_once, possible_without
 from magtensor.loop.searching.gates import OF_THE_LAW, Candidate, explained_before, explained_by, gained_of_a_log
 from magtensor.loop.searching.likeness import (
@@ -59,6 +60,7 @@ LEAST_SENSORS = 3  # from here on noise of single sensors does not imitate a fac
 QUIET = 5.0  # times the median square of a step: of a few dozen values none is as large by chance
 ASKED = 5  # times of one survey: in each round, and once more without the samples or the effects that are left out
 LEVEL_ROUNDS = 3
+MOSTLY = 0.5  # of the samples
 MOST_RENEWALS = 10
 SETTLED = 0.1  # of the noise of a sample, along the vectors of a source
 LEAST_NOISE = 0.1  # of what the fit believes
@@ -116,7 +118,7 @@ def sought(state: State, record: Record, *, may_follow: bool = False) -> Sought 
     ----------
     may_follow: whether the waveform may resemble a logged channel, one that was tried and does not explain it.
     """
-    state = state.unabridged
+    state = _with_known_memories(state.unabridged)
     residual = state.residual
     if residual.across is None:
         return None
@@ -162,6 +164,18 @@ def sought(state: State, record: Record, *, may_follow: bool = False) -> Sought 
         objection=objection,
         left_by=left_by,
     )
+
+
+def _with_known_memories(state: State) -> State:
+    """The same without the samples at the start in which the state that adopted effects began with, a play's or a
+    filter's, still shows: nobody knows it, and what it leaves there all sensors may share. All of them where these are
+    half of the survey."""
+    forgotten = max((forgotten_at(model, state.excitation) for model in state.adopted), default=0)
+    known = np.flatnonzero(state.residual.samples >= forgotten)
+    if len(known) == len(state.residual.samples) or len(known) < MOSTLY * len(state.residual.samples):
+        return state
+    terms = None if state.terms is None else state.terms.at(known)
+    return replace(state, residual=state.residual.smaller(known), terms=terms)
 
 
 def _against(

@@ -19,7 +19,6 @@ one of a few samples that the colour of the noise made much of.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,6 +41,7 @@ from magtensor.loop.remainder.predictable import (
     enough_for_the_total_field,
     predictable_in_the_total_field,
 )
+from magtensor.loop.searching.along_one_vector import ALONG, along_one_vector, events, is_along, vector_of
 from magtensor.loop.searching.contribution import happens_once, moments, slices
 from magtensor.loop.searching.found import Search, without_and_with
 from magtensor.loop.searching.suspects import unlikely
@@ -51,7 +51,6 @@ from magtensor.loop.searching.wandering_gain import of_a_wandering_gain
 WORSE = 1.01  # times the held-out rms without an effect, all noise alike: noise of a colour does not make up for that
 NAMELESS = 2.0  # times what stays, that a response to a logged vector explains if it is the law
 LONE = 2  # events along one vector may be all that happened, where nothing stays
-ALONG = 0.95  # cosine, with a source's vector or another event's; of one sensor 5 % of all directions are as near
 MUCH_OF_IT = 0.5  # of what an event explains, that is left out of the calibration
 FACTOR = 2.0  # of its size, that this may differ by: what is far larger is another thing
 AS_MUCH = 0.25  # of an event, that it may differ by from what it is at another time
@@ -166,12 +165,12 @@ def of_nothing(state: State, fixed: int) -> tuple[list[int], str] | None:
 
 def _of_an_adopted_source(state: State, fixed: int) -> tuple[list[int], str] | None:
     """An offset that came or went and lies along the vectors of an adopted source that nobody logged."""
-    source = next((v for v in (_vector(state, i) for i, a in enumerate(state.adopted) if a.name == NAME)), None)
+    source = next((v for v in (vector_of(state, i) for i, a in enumerate(state.adopted) if a.name == NAME)), None)
     if source is None:
         return None
     for place, model in enumerate(state.adopted):
-        own = _vector(state, place) if place >= fixed and happens_once(model) else None
-        if own is not None and _along(own, source):
+        own = vector_of(state, place) if place >= fixed and happens_once(model) else None
+        if own is not None and is_along(own, source):
             return [place], f"it lies along the vectors of {NAME}, of which it is a part"
     return None
 
@@ -181,7 +180,7 @@ def of_what_is_left_out(found: Search, fixed: int) -> tuple[list[int], str] | No
     are off by, and more than it explains, or by as much as it is: what it is a part of acts at other times too, by a
     law that has no name."""
     state = found.told
-    known = _events(state, fixed)
+    known = events(state, fixed)
     out = ~np.asarray(state.fit.keep)
     left = everywhere(found.record, state) if known and out.any() else None
     if left is None or left.across is None:
@@ -258,17 +257,14 @@ def _as_large(share: Array, samples: NDArray[np.int_], state: State, place: int)
 
 def _of_one_that_switches(state: State, fixed: int) -> tuple[list[int], str] | None:
     """Several offsets that came or went along one vector: something switches, perhaps more often than they tell."""
-    known = _events(state, fixed)
-    for _, first in known:
-        places = [i for i, v in known if _along(v, first) or _along(first, v)]
-        if len(places) > 1:
-            sensors = [s for s, v in zip(state.excitation.sensors, first.reshape(-1, 3), strict=True) if v.any()]
-            return (
-                places,
-                f"something in {', '.join(sensors)} switches along one vector more often than such events tell, or "
-                "goes on changing",
-            )
-    return None
+    several = along_one_vector(state, fixed)
+    if not several:
+        return None
+    places, sensors = several
+    return places, (
+        f"something in {', '.join(sensors)} switches along one vector more often than such events tell, or goes on "
+        "changing"
+    )
 
 
 def of_what_jumps(state: State, fixed: int) -> tuple[list[int], str] | None:
@@ -279,7 +275,7 @@ def of_what_jumps(state: State, fixed: int) -> tuple[list[int], str] | None:
         return None
     run = state.excitation.run[residual.samples]
     for place, model in enumerate(state.adopted):
-        vector = _vector(state, place) if place >= fixed and happens_once(model) else None
+        vector = vector_of(state, place) if place >= fixed and happens_once(model) else None
         if vector is None:
             continue
         seen = vector / residual.noise @ residual.projector
@@ -287,7 +283,7 @@ def of_what_jumps(state: State, fixed: int) -> tuple[list[int], str] | None:
         stays = residual.across @ seen / size if size > 0.0 else np.zeros(len(residual.across))
         beyond = max(float(np.mean(stays**2)) - 1.0, 0.0) ** 0.5
         if beyond > SLOW and size < STANDS_OUT * beyond and jumpiness(stays, run) > JUMPS:
-            places = [i for i, v in _events(state, fixed) if i == place or _along(v, vector) or _along(vector, v)]
+            places = [i for i, v in events(state, fixed) if i == place or is_along(v, vector) or is_along(vector, v)]
             amount = beyond / size * float(np.sqrt(np.mean(vector[vector != 0.0] ** 2)))
             return places, f"what stays along its vector goes in jumps too, of {amount:.3g} nT rms"
     return None
@@ -301,7 +297,7 @@ def _of_one_tone(state: State, fixed: int) -> tuple[list[int], str] | None:
         (i, f, _phased_vector(state, i)) for i, a in enumerate(state.adopted) if i >= fixed and (f := _frequency(a))
     ]
     for _, lowest, first in tones:
-        along = [(i, f) for i, f, v in tones if _along(v, first)]
+        along = [(i, f) for i, f, v in tones if is_along(v, first)]
         close = [(i, f) for i, f in along if lowest <= f < CLOSE * lowest]
         own = [(i, f) for i, f in close if not any(_harmonic(f, g, float(x.elapsed[-1])) for _, g in along)]
         if len(own) >= SIDEBANDS:
@@ -325,30 +321,6 @@ def _phased_vector(state: State, place: int) -> NDArray[np.complex128]:
     each = terms.part_weight * state.theta[place][terms.part_term] * np.where(terms.part_series == 0, 1.0, 1.0j)
     np.add.at(vector, terms.part_output, each)
     return vector
-
-
-def _vector(state: State, place: int) -> Array | None:
-    """(3 S,) nT for a unit of the one series of an adopted model, by which it moves each output; None where it has
-    several series."""
-    terms = state.adopted[place].terms(state.excitation)
-    if terms.series.shape[1] != 1 or terms.delay is not None:
-        return None
-    vector = np.zeros(3 * len(state.excitation.sensors))
-    raw = terms.part_output >= 0
-    np.add.at(vector, terms.part_output[raw], terms.part_weight[raw] * state.theta[place][terms.part_term[raw]])
-    return vector if vector.any() else None
-
-
-def _events(state: State, fixed: int) -> list[tuple[int, Array]]:
-    """The places of the adopted events that have one series, and their vectors (3 S,) nT."""
-    events = [(i, _vector(state, i)) for i, a in enumerate(state.adopted) if i >= fixed and happens_once(a)]
-    return [(i, v) for i, v in events if v is not None]
-
-
-def _along(one: NDArray[Any], other: NDArray[Any]) -> bool:
-    """Whether a vector lies along another one, in the outputs that it moves."""
-    seen = np.where(one != 0.0, other, 0.0)
-    return abs(np.vdot(one, seen)) > ALONG * float(np.linalg.norm(one) * np.linalg.norm(seen))
 
 
 def _part_of_a_source(found: Search, fixed: int) -> tuple[list[int], str] | None:

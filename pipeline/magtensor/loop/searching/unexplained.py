@@ -43,6 +43,7 @@ from magtensor.loop.remainder.sparse_readings import SparseReadings, sparse_read
 from magtensor.loop.remainder.tones import channels_of_the_line, of_the_turning
 from magtensor.loop.remainder.turned_too_far import turned_too_far_words
 from magtensor.loop.remainder.with_the_field import with_the_field
+from magtensor.loop.searching.along_one_vector import switching_words
 from magtensor.loop.searching.found import Search
 from magtensor.loop.searching.gates import explained_by
 from magtensor.loop.searching.latent import LEFT_BY_LAWS, shared_words
@@ -106,6 +107,7 @@ def unexplained(found: Search, record: Record) -> dict[str, Any]:
         words.insert(0, size if excess else "in all no more than white noise leaves, but not at random")
     beside += [sparse.words] if sparse is not None else suspects.noise_words
     beside += [*suspects.small_words, *([began] if began else [])]
+    beside += switching_words(state, len(found.first.adopted))
     beside += spike_words(outlying, bad & ~(lasting(bad) | starts | unknown_yet | theirs))
     if record.absent:
         beside.append(f"not searched, for most of the survey lacks it: {', '.join(record.absent)}")
