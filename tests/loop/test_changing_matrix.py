@@ -9,7 +9,7 @@ import pytest
 from loop_cases import Array, linear_state, synthetic
 
 from magtensor.loop.fitting.model import Fitting, Record
-from magtensor.loop.remainder.changing_matrix import SLOW, changing_matrices
+from magtensor.loop.remainder.changing_matrix import SLOW, changing_matrices, changing_words
 from magtensor.loop.searching.search import search
 from magtensor.loop.searching.unexplained import NOISE, unexplained
 from magtensor.registry import Registry
@@ -66,7 +66,8 @@ def test_a_mount_that_creeps_is_told_with_its_sensor_and_size() -> None:
     disturbed = turned(record, 2, 4e-5 * creep(1200))
     (found,) = changing_matrices(linear_state(disturbed), ALPHA)
     assert found.sensors == ("S3",)
-    assert found.words.endswith("changes with time: C of S3 is not constant")
+    (words,) = changing_words([found])
+    assert words.endswith("changes with time: C of S3 is not constant")
     # four alike sensors show three quarters of what one adds, spread over nine contrasts and |b| - F
     added = np.sum((disturbed.raw - record.raw) ** 2) / len(record.raw)
     assert found.rms == pytest.approx(np.sqrt(0.75 * added / 10.0), rel=0.1)
@@ -94,7 +95,7 @@ def test_no_name_of_a_channel_is_in_the_way() -> None:
     logged = {name: rng.standard_normal(1200) for name in ("cosines", "time", "jump", "the field")}
     disturbed = with_channels(turned(synthetic(3, turning_s=3.0), 2, 4e-5 * creep(1200)), **logged)
     (found,) = changing_matrices(linear_state(disturbed), ALPHA)
-    assert found.waveform == SLOW and "changes with time" in found.words
+    assert found.waveform == SLOW and "changes with time" in changing_words([found])[0]
 
 
 def test_a_neighbour_that_is_heard_while_a_pump_runs() -> None:
@@ -114,6 +115,16 @@ def test_two_sensors_of_five_each_in_its_own_way() -> None:
     disturbed = turned(turned(record, 0, 6e-5 * creep(1200)), 3, 4e-5 * w)
     found = changing_matrices(linear_state(with_channels(disturbed, temperature=w)), ALPHA)
     assert {(one.sensors, one.waveform) for one in found} == {(("S1",), SLOW), (("S4",), "temperature")}
+    assert len(changing_words(found)) == 2
+
+
+def test_of_sensors_that_change_with_the_same_one_sentence_is_said() -> None:
+    record = synthetic(3, turning_s=3.0)
+    disturbed = turned(turned(record, 2, 4e-5 * creep(1200)), 0, 3e-5 * creep(1200))
+    found = changing_matrices(linear_state(disturbed), ALPHA)
+    assert [one.sensors for one in found] == [("S3",), ("S1",)]
+    (words,) = changing_words(found)
+    assert words.endswith(f"C of S3 is not constant, nor is that of S1 ({found[1].rms:.3g} nT rms)")
 
 
 def test_of_two_sensors_either_may_have_turned() -> None:
@@ -121,7 +132,7 @@ def test_of_two_sensors_either_may_have_turned() -> None:
     disturbed = turned(synthetic(9, sensors=2, turning_s=3.0), 0, 4e-5 * creep(1200))
     (found,) = changing_matrices(linear_state(disturbed), ALPHA)
     assert set(found.sensors) == {"S1", "S2"}
-    assert " or " in found.words
+    assert " or " in found.whose
 
 
 @pytest.mark.parametrize("exponent", [1.0, 2.0])

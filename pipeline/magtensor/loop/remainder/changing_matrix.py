@@ -49,14 +49,29 @@ class ChangingMatrix:
     rms: float
 
     @property
-    def words(self) -> str:
-        """For the verdict."""
-        how = "with time" if self.waveform == SLOW else f"with {self.waveform}"
-        amount = f"{self.rms:.3g} nT rms" if self.rms > 0 else "a part"  # seen in noise made white alone
-        return (
-            f"{amount} of it goes with the field in a way that changes {how}: "
-            f"C of {' or '.join(self.sensors)} is not constant"
+    def whose(self) -> str:
+        """The sensor, or those that it may be."""
+        return " or ".join(self.sensors)
+
+    @property
+    def amount(self) -> str:
+        """What is explained, in words."""
+        return f"{self.rms:.3g} nT rms" if self.rms > 0 else "a part"  # seen in noise made white alone
+
+
+def changing_words(found: Sequence[ChangingMatrix]) -> list[str]:
+    """For the verdict: one sentence for all that change with the same."""
+    words = []
+    for waveform in dict.fromkeys(one.waveform for one in found):
+        those = [one for one in found if one.waveform == waveform]
+        how = "with time" if waveform == SLOW else f"with {waveform}"
+        others = [f"{one.whose} ({one.amount})" for one in those[1:]]
+        too = f", nor is that of {' and '.join(others)}" if others else ""
+        words.append(
+            f"{those[0].amount} of it goes with the field in a way that changes {how}: "
+            f"C of {those[0].whose} is not constant{too}"
         )
+    return words
 
 
 def changing_matrices(state: State, alpha: float) -> list[ChangingMatrix]:

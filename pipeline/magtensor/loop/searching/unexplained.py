@@ -21,7 +21,7 @@ from magtensor.loop.fitting.model import Record, State
 from magtensor.loop.fitting.refit import disturbed
 from magtensor.loop.fitting.separation import SECOND_ORDER
 from magtensor.loop.remainder.along_an_effect import along_an_effect_words
-from magtensor.loop.remainder.changing_matrix import changing_matrices
+from magtensor.loop.remainder.changing_matrix import changing_matrices, changing_words
 from magtensor.loop.remainder.excess import excess_rms
 from magtensor.loop.remainder.flagged import (
     ALIKE,
@@ -147,7 +147,7 @@ def _what_shows(found: Search, record: Record, excess: float, sparse: SparseRead
         if alone is not None and alone[2] < ALPHA and alone[1] ** 2 >= least:
             words.append(f"a line of |b| - F at {alone[0]:.4g} Hz (period {1 / alone[0]:.4g} s), {alone[1]:.3g} nT rms")
     following, changing = shared_out(
-        lambda of: of(state), [attitude_words, lambda state: [m.words for m in changing_matrices(state, ALPHA)]]
+        lambda of: of(state), [attitude_words, lambda state: changing_words(changing_matrices(state, ALPHA))]
     )
     predictable = following or converter_words(state)
     words.extend(predictable)
