@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from magtensor.accuracy import figure
 from magtensor.calibration.joint import calibrated
 from magtensor.calibration.types import Array
 from magtensor.components import Component
@@ -434,7 +435,7 @@ def shared_words(found: Sought, record: Record) -> str:
     """A waveform that the sensors share, in words."""
     strength = np.sqrt(np.sum(found.direction**2, axis=1))
     each = ", ".join(f"{s} {a:.2g} nT" for s, a in zip(record.sensors, strength, strict=True))
-    course = "switches between two levels" if found.switches else f"has periods from {found.period_s:.2g} s on"
+    course = "switches between two levels" if found.switches else f"has periods from {figure(found.period_s)} s on"
     part = f"{found.share:.0%}" if found.share >= 0.01 else "less than 1%"
     words = (
         f"the sensors share one waveform ({each}; {part} of the variance of what differs between them), which {course}"
