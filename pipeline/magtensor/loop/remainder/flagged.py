@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from magtensor.accuracy import figure
 from magtensor.calibration.types import Array, Mask
 from magtensor.error_models.excitation import Excitation
 from magtensor.in_a_row import in_a_row
@@ -138,7 +139,7 @@ def flagged_words(
     stretches = f"{runs} stretch{'es' * (runs > 1)}"
     words = (
         f"{int(flagged.sum())} samples in {stretches} ({after[0]:.4g} to {after[-1]:.4g} s after the start) fit no "
-        f"calibration, by {amount:.3g} nT rms{where}: they are flagged and have no part in the calibration"
+        f"calibration, by {figure(amount)} nT rms{where}: they are flagged and have no part in the calibration"
         f"{_at_an_end(flagged, state, record)}{between_switches(flagged, state)}"
     )
     if alike and record.station is not None and between_readings(flagged, record):
@@ -147,7 +148,7 @@ def flagged_words(
             return f"{words}; they lie between readings of the base station", True
     if amount > FAR * usual:
         return words, False
-    return f"{words}; slow noise, {usual:.3g} nT rms there, may reach as far by itself", True
+    return f"{words}; slow noise, {figure(usual)} nT rms there, may reach as far by itself", True
 
 
 def _as_unread(away: Array, flagged: Mask, record: Record) -> bool:

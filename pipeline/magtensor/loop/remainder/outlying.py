@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from magtensor.accuracy import figure
 from magtensor.calibration.joint_together import ABOUT, LEAST_FOR_REJECTION
 from magtensor.calibration.types import Array, Mask
 from magtensor.loop.evidence.residual import Residual
@@ -117,7 +118,7 @@ def outlying_words(found: Outlying, left_out: Mask) -> tuple[list[str], Mask]:
         amount = float(np.sqrt(np.mean(found.off[wrong, place] ** 2)))
         words.append(
             f"{found.names[place]} is off by more than {BEYOND:.0f} times its noise in {count} samples "
-            f"({count / len(wrong):.1%}), {amount:.3g} nT rms there, too often for spikes: "
+            f"({count / len(wrong):.1%}), {figure(amount)} nT rms there, too often for spikes: "
             f"{'all' if used == count else used} of them pass for noise and have a part in the calibration"
         )
     return words, told
@@ -143,7 +144,7 @@ def spike_words(found: Outlying, spikes: Mask) -> list[str]:
         ("spikes", "") if by_themselves else ("single samples", ", and their neighbours are off nearly as far")
     )
     return [
-        f"{what}: {count} samples ({count / len(spikes):.1%}) fit no calibration, by {np.median(size):.3g} nT in "
+        f"{what}: {count} samples ({count / len(spikes):.1%}) fit no calibration, by {figure(np.median(size))} nT in "
         f"the median, {'mostly ' if counts.max() < count else ''}on {', '.join(most)}{as_others}: they are flagged and "
         "have no part in the calibration"
     ]
