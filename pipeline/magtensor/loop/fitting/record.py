@@ -48,7 +48,7 @@ def record_of(
             kept: another survey may hold another value.
 
     Raises:
-        NotEnoughData: no samples are left in use.
+        NotEnoughData: no samples are left in use, and neither all nor chosen ones were asked for.
     """
     raw = np.asarray(survey.values("b_raw"), dtype=float)
     time = survey.time
@@ -79,7 +79,7 @@ def record_of(
             else:
                 logged[name] = _filled(time, values, finite)
     keep = np.flatnonzero(use)
-    if len(keep) < 2:
+    if not steady and len(keep) < 2:
         needed = "readings of all sensors" + " and a total field" * (total_field is not None)
         raise NotEnoughData(f"no samples with {needed} are left in use", where=str(survey.attributes.get("source", "")))
     if origins is None:
