@@ -69,6 +69,7 @@ def test_another_law_or_channel_stays_what_it_is() -> None:
         looked(at, "channel_response", channel="current_heater", times_field=True),
         looked(at, "channel_response", channel="temperature"),
         looked(at, "channel_rate", channel="current_heater"),
+        looked(at, "channel_response", channel="current_heater", lag_s=0.6 * SAMPLES),
         current,
     ):
         assert by_its_name(chosen, [current], at) is chosen

@@ -12,6 +12,7 @@ from magtensor.error_models.settings import AnyChannel, profiled
 from magtensor.error_models.terms import Terms
 from magtensor.loop.fitting.model import Adopted, State, generic
 from magtensor.loop.searching.gates import Candidate
+from magtensor.loop.searching.rivals import hardly_begun
 
 ALIKE = 0.02  # of the rms: noise of a log that one of them is read with, and no law is known better
 
@@ -19,11 +20,12 @@ ALIKE = 0.02  # of the rms: noise of a log that one of them is read with, and no
 def by_its_name(chosen: Candidate, possible: Sequence[Candidate], state: State) -> Candidate:
     """A response that no model names as the first of the possible models that, with its settings, adds the same to the
     outputs but for a constant; itself where there is none. A search of the settings may have ended elsewhere for the
-    one than for the other: where the fit without the effect is far off, every lag seems wrong."""
-    if not generic(chosen.model) or chosen.moved is not None:
-        return chosen
+    one than for the other: where the fit without the effect is far off, every lag seems wrong. Not of one that lags by
+    half the survey: it is the sum of its channel over time, or a drift, and not every model knows that of its lag."""
     seen = chosen.before or state
     x = seen.excitation
+    if not generic(chosen.model) or chosen.moved is not None or hardly_begun(chosen.model, x):
+        return chosen
     terms = chosen.model.terms(x)
     for other in possible:
         if generic(other.model):

@@ -91,7 +91,9 @@ def search(
     fewer = bool((state.fit.keep & ~last.fit.keep).any())
     if over or fewer:  # what only these samples asked for goes with them
         last, steps = _weighed_once_more(record, last, steps, how, len(declared))
-    shared = sought(last, record) if ended.shared is None or last is not ended.settled else ended.shared
+    shared = ended.shared
+    if shared is None or fewer or last is not ended.settled:
+        shared = sought(last, record)
     evenly = unweighed(record, last, how)
     not_tested = _not_tested(last.excitation, models)
     found = Search(first, last, steps, not_tested, rounds.failed, record, shared, how, evenly)
