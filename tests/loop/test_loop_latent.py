@@ -79,7 +79,7 @@ def test_a_source_that_comes_and_goes_tells_as_much_as_before() -> None:
 def test_one_source_in_noise_that_is_loud_for_a_while_is_one(loud_times: float) -> None:
     """That noise makes what the sensors share vary as few samples would; a second source is one all the same."""
     strengths = []
-    for seed in range(40):
+    for seed in range(20):
         rng = np.random.default_rng(seed)
         basis = plane(rng, 4)
         loud = np.where(np.arange(3000) < 300, loud_times, 1.0)[:, None]
@@ -93,7 +93,7 @@ def test_one_source_in_noise_that_is_loud_for_a_while_is_one(loud_times: float) 
             strengths.append(second_factor(test, basis, factors))
     one, two = np.reshape(strengths, (-1, 2)).T
     assert np.count_nonzero(one) <= 1  # one test in a thousand
-    assert np.count_nonzero(two) >= 30
+    assert np.count_nonzero(two) >= 15
 
 
 def test_a_factor_is_told_from_noise_and_its_direction_found() -> None:
